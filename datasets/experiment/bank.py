@@ -17,7 +17,7 @@ from scipy.linalg import solve_discrete_lyapunov
 from scipy.special import log_ndtr, ndtri_exp
 
 from datasets.experiment.geometry import SOURCES, TAUS_S, Geometry
-from datasets.experiment.splitting import Limits
+from datasets.experiment.sampling import Limits
 from schemas.arrays import Bools, Floats
 from schemas.config import MonitorConfig, threshold_factor
 from schemas.frozen import frozen

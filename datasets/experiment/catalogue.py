@@ -12,8 +12,7 @@ from functools import partial
 import polars as pl
 
 from datasets.experiment.catalogue_faults import CatalogueFault, Journey, catalogue
-from datasets.experiment.catalogue_tables import faults_table, monitors_table
-from datasets.experiment.catalogue_text import catalogue_page
+from datasets.experiment.catalogue_report import catalogue_page, faults_table, monitors_table
 from datasets.experiment.catalogue_trial import JOURNEYS, Stage, stage, with_fault
 from datasets.experiment.tables import Contents, Row
 from datasets.motion import build_motion

@@ -14,6 +14,7 @@ from functools import partial
 import numpy as np
 import polars as pl
 
+from datasets.experiment.figures import drawn_figures
 from datasets.experiment.geometry import CONSTELLATIONS, PLACE, Geometry, default_geometry
 from datasets.experiment.passage import NEVER, FirstPassages, first_passages
 from datasets.experiment.plan import ExperimentPlan, bank_forms, failure_forms
@@ -30,9 +31,6 @@ _PMD_POINTS = 81
 
 def made(repetitions: int, seed: int, jobs: int, config: Configuration | None = None) -> Contents:
     """`pmd`, `detection`, `geometry` and pictures of the experiment."""
-    from datasets.experiment.figures import drawn_figures, require_matplotlib
-
-    require_matplotlib()
     frames = run_diagnostics(repetitions, seed, jobs)
     return {**frames, **drawn_figures(frames["pmd"], frames["detection"], frames["geometry"])}
 

@@ -32,7 +32,6 @@ _UP, _CROSS, _INCREMENTS, _POSITION = (
     SIGNALS.index(name) for name in ("up", "map_cross", "odometer_increments", "odometer_position")
 )
 _TINY = 1e-12
-_OPEN = np.iinfo(np.int32).max
 
 
 class FirstPassages(NamedTuple):
@@ -126,22 +125,18 @@ class FirstAnswers:
         self._banks = banks
         self._rows = np.vstack([banks.rows, failures.rows]) * weights
         self._bounds = csr_array(np.hstack([np.maximum(self._rows, 0.0), np.minimum(self._rows, 0.0)]))
-        self._terms = _sparse(self._rows)
-        self._members = block_diag(banks.members, failures.members).astype(np.bool_)
-        self._asked, self._asks = _padded([np.flatnonzero(column) for column in self._members.T])
-        patterns, self._pattern_of_form = np.unique(self._members.T, axis=0, return_inverse=True)
-        self._patterns = _padded([np.flatnonzero(pattern) for pattern in patterns])
+        members = block_diag(banks.members, failures.members)
+        self._forms = [np.flatnonzero(row) for row in members]
         self._failure_limit = failures.threshold[0]
         self._slope = np.concatenate([banks.slope, failures.slope])
         self._monitors = banks.slope.size
-        self._first = np.full((len(self._members), self._rates.size, repetitions), _OPEN, dtype=np.int32)
-        self._largest_open = np.full((len(self._members), repetitions), self._rates.max())
+        self._first = np.full((len(members), self._rates.size, repetitions), NEVER, dtype=np.int32)
         self.alarmed = np.zeros((banks.members.shape[0], repetitions), dtype=np.bool_)
 
     @property
     def first(self) -> Ints:
         """Seconds from onset to the first passage, shape (questions, rates, repetitions)."""
-        return np.where(self._first == _OPEN, np.int32(NEVER), self._first)
+        return self._first
 
     def thresholds(self, begin: int, end: int) -> Floats:
         """Of epochs begin+1 .. end, shape (epochs, forms)."""
@@ -156,6 +151,7 @@ class FirstAnswers:
         return np.asarray(np.maximum(np.hstack([smooth, drift]) * self._slope, _TINY))
 
     def before_onset(self, basis: Floats, begin: int) -> None:
+        """Note which questions are alarmed in these epochs; `basis` (epochs, basis, repetitions)."""
         threshold = self.thresholds(begin, begin + len(basis))
         high, low = self._envelope(basis)
         least = threshold.min(axis=0)[:, None]
@@ -166,24 +162,39 @@ class FirstAnswers:
             self.alarmed[:, index] |= (self._banks.members & failing).any(axis=1)
 
     def after_onset(self, basis: Floats, begin: int) -> None:
+        """Note the first passages in these epochs; `basis` (epochs, basis, repetitions)."""
         end = begin + len(basis)
         threshold = self.thresholds(begin, end)
         response = self.responses(begin, end)
         high, low = self._envelope(basis)
         least = threshold.min(axis=0)[:, None]
-        reach = np.subtract(least, high, out=high)
-        reach /= response[-1][:, None]
-        self._look(basis, reach <= self._open_for_forms(), threshold, response, begin, 1.0)
-        # Against the ramp, -m > T + c b: false alarms, likelier for the slower ramp.
-        self._look(basis, low < -least, threshold, response, begin, -1.0)
+        slowest = (least - high) / response[-1][:, None]
+        largest_open = np.where(self._first == NEVER, self._rates[:, None], -np.inf).max(axis=1)
+        for question, asked in enumerate(self._forms):
+            waiting = largest_open[question]
+            possible = (slowest[asked] <= waiting) | ((low[asked] < -least[asked]) & (waiting > 0.0))
+            runs = np.flatnonzero(possible.any(axis=0))
+            if runs.size:
+                forms = asked[possible.any(axis=1)]
+                terms = np.flatnonzero(self._rows[forms].any(axis=0))
+                values = np.matmul(self._rows[np.ix_(forms, terms)], basis[:, terms[:, None], runs])
+                self._note(question, runs, values, threshold[:, forms, None], response[:, forms, None], begin)
 
-    def _open_for_forms(self) -> Floats:
-        """Largest rate that some question of the form still waits for, shape (forms, repetitions)."""
-        lists, _ = self._patterns
-        largest = self._largest_open[lists[:, 0]]
-        for column in lists.T[1:]:
-            np.maximum(largest, self._largest_open[column], out=largest)
-        return np.asarray(largest[self._pattern_of_form])
+    def _note(
+        self, question: int, runs: Index, values: Floats, threshold: Floats, response: Floats, begin: int
+    ) -> None:
+        """When each rate, if still open, is first answered; `values` (epochs, forms, runs)."""
+        # The smallest rate at which a form fails with the ramp; against it, -m > T + c b: a false alarm, likelier for
+        # the slower ramp.
+        with_ramp = ((threshold - values) / response).min(axis=1)
+        against = -((threshold + values) / response).min(axis=1)
+        for index, rate in enumerate(self._rates):
+            waiting = self._first[question, index, runs] == NEVER
+            if waiting.any():
+                failing = (with_ramp < rate) | (against > rate)
+                found = failing.any(axis=0) & waiting
+                when = failing.argmax(axis=0) + begin + 1 - self._plan.onset_s
+                self._first[question, index, runs[found]] = when[found]
 
     def _envelope(self, basis: Floats) -> tuple[Floats, Floats]:
         """Upper and lower bound of every form over the block."""
@@ -191,51 +202,19 @@ class FirstAnswers:
         bottom = basis.min(axis=0)
         return self._bounds @ np.vstack([top, bottom]), self._bounds @ np.vstack([bottom, top])
 
-    def _values(self, basis: Floats, form: Index, run: Index) -> Floats:
-        """Forms of runs, epoch by epoch, shape (epochs, pairs)."""
-        place, factor = self._terms
-        values: Floats = basis[:, place[form, 0], run] * factor[form, 0]
-        for term in range(1, place.shape[1]):
-            values += basis[:, place[form, term], run] * factor[form, term]
-        return values
-
-    def _look(self, basis: Floats, chosen: Bools, threshold: Floats, response: Floats, begin: int, side: float) -> None:
-        """First passages of the chosen pairs (forms, runs) on this side, epoch by epoch."""
-        form, run = np.nonzero(chosen)
-        if form.size:
-            reach = threshold[:, form] - side * self._values(basis, form, run)
-            reach /= response[:, form]
-            self._keep_earliest(reach, side * self._rates, form, run, begin)
-
-    def _keep_earliest(self, series: Floats, limits: Floats, form: Index, run: Index, begin: int) -> None:
-        """Tell every question that holds the form when `series` (epochs, pairs) first fell below each limit."""
-        least = series.min(axis=0)
-        pair, rate = np.nonzero(
-            (least[:, None] < limits) & (self._rates <= self._largest_open[:, run].max(axis=0)[:, None])
-        )
-        if pair.size == 0:
-            return
-        when = (series[:, pair] < limits[rate]).argmax(axis=0) + begin + 1 - self._plan.onset_s
-        hit, place = np.nonzero(self._asks[form[pair]])
-        question = self._asked[form[pair[hit]], place]
-        chosen = run[pair[hit]]
-        np.minimum.at(self._first, (question, rate[hit], chosen), when[hit].astype(np.int32))
-        still_open = np.where(self._first[question, :, chosen] == _OPEN, self._rates, -np.inf)
-        self._largest_open[question, chosen] = still_open.max(axis=1)
-
 
 def first_passages(
     plan: ExperimentPlan, banks: Forms, failures: Forms, repetitions: int, rng: np.random.Generator
 ) -> FirstPassages:
     """Simulate `repetitions` runs of the plan and answer all of its questions."""
     paths = NoisePaths(plan, repetitions, rng)
-    watch = FirstAnswers(plan, banks, failures, paths.weights, repetitions)
+    answers = FirstAnswers(plan, banks, failures, paths.weights, repetitions)
     for begin, end in _blocks(0, plan.onset_s):
-        watch.before_onset(paths.advance(end - begin), begin)
+        answers.before_onset(paths.advance(end - begin), begin)
     for begin, end in _blocks(plan.onset_s, plan.span_s, _FIRST_BLOCK):
-        watch.after_onset(paths.advance(end - begin), begin)
+        answers.after_onset(paths.advance(end - begin), begin)
     questions = banks.members.shape[0]
-    return FirstPassages(watch.first[:questions], watch.first[questions:], watch.alarmed)
+    return FirstPassages(answers.first[:questions], answers.first[questions:], answers.alarmed)
 
 
 def _blocks(begin: int, end: int, shortest: int = BLOCK_EPOCHS) -> Iterator[tuple[int, int]]:
@@ -245,17 +224,3 @@ def _blocks(begin: int, end: int, shortest: int = BLOCK_EPOCHS) -> Iterator[tupl
         size = min(max(shortest, (at - begin) // 8), BLOCK_EPOCHS, end - at)
         yield at, at + size
         at += size
-
-
-def _sparse(rows: Floats) -> tuple[Index, Floats]:
-    """Columns and factors of the non-zero entries of each row, padded with factor zero."""
-    width = int((rows != 0).sum(axis=1).max())
-    place = np.argsort(rows == 0, axis=1, kind="stable")[:, :width]
-    return place, np.take_along_axis(rows, place, axis=1)
-
-
-def _padded(lists: list[Index]) -> tuple[Index, Bools]:
-    """Lists of indices as one array, and where it holds them; short ones repeat their first."""
-    width = max(items.size for items in lists)
-    padded = np.array([np.concatenate([items, np.full(width - items.size, items[0])]) for items in lists])
-    return padded, np.arange(width) < np.array([items.size for items in lists])[:, None]

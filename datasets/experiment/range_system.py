@@ -4,7 +4,7 @@ Range errors are those of each satellite (DIAG Table 1); the train is held on it
 constant in a run. Residuals may be recorded more slowly than positions: the monitor then looks at these epochs only.
 Its value is |z|^2 of a Gaussian vector z (the whitened residuals): one Gauss-Markov vector per error source, and the
 survey's error, which stays. A miss is a path of z + ramp that stays inside a ball, which is convex again, so the same
-twisted population serves (`splitting`). Alarms: an exceedance is forced at an epoch drawn at random, as in `sampling`.
+twisted population serves (`sampling`). Alarms: an exceedance is forced at an epoch drawn at random.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ import numpy as np
 from scipy.special import chdtr, chdtri
 
 from datasets.experiment.geometry import TAUS_S, Geometry
-from datasets.experiment.splitting import Limits
+from datasets.experiment.sampling import Limits
 from pipeline.stages.monitors.pseudorange import clock_columns, line_of_sight_rows
 from schemas.arrays import Bools, Floats
 from schemas.frozen import frozen

@@ -15,12 +15,12 @@ from datasets.experiment.geometry import CONSTELLATIONS, Constellation, default_
 from datasets.experiment.range_system import RangePlan, miss_at_one_epoch, range_system
 from datasets.experiment.sampling import (
     SMALLEST,
+    System,
     false_alarm_probability,
     figures,
     first_below,
     missed_detection_probability,
 )
-from datasets.experiment.splitting import System
 from datasets.experiment.tables import Contents, Row, table
 from schemas.config import Configuration
 

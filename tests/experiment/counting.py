@@ -20,12 +20,12 @@ from datasets.experiment.geometry import default_geometry
 from datasets.experiment.range_system import RangePlan, range_system
 from datasets.experiment.sampling import (
     Probability,
+    System,
     false_alarm_probability,
     first_below,
     missed_detection_probability,
     pooled,
 )
-from datasets.experiment.splitting import System
 from datasets.experiment.workers import generator, in_blocks
 from pipeline.stages.run_row.bounds import clopper_pearson
 from schemas.arrays import Floats

@@ -16,9 +16,9 @@ from datasets.experiment.sampling import (
     figures,
     first_below,
     missed_detection_probability,
+    most_probable_miss,
     population_of,
 )
-from datasets.experiment.splitting import most_probable_miss
 from datasets.experiment.workers import generator, in_blocks
 from schemas.config import Configuration, MonitorConfig
 from schemas.errors import UsageError

@@ -8,10 +8,9 @@ from math import log10
 
 import polars as pl
 
-from datasets.experiment.drawing import COLOURS, Axis, Curve, both_ways_log, plot, svg, text
+from datasets.experiment.drawing import COLOURS, Axis, Curve, plot, pmd_plot, svg, text
 from datasets.faults import FaultKind
 
-_TIMES_S = (-3000.0, -1000.0, -300.0, -100.0, -30.0, -10.0, -3.0, 0.0, 3.0, 10.0, 30.0, 100.0, 300.0)
 _DETECT_S = (0.1, 1.0, 10.0, 100.0, 1000.0, 10000.0)
 _TARGETS = {"along": "along the track", "cross": "across the track", "satellite": "in one satellite's range"}
 _STRIP_LEFT = 150.0
@@ -54,11 +53,7 @@ def _pmd(title: str, pmd: pl.DataFrame) -> str:
         )
         for (amount,), part in pmd.group_by("amount", maintain_order=True)
     ]
-    low = min(float(pmd["time_since_failure_s"].min()), -1.0)  # type: ignore[arg-type]
-    high = max(float(pmd["time_since_failure_s"].max()), 1.0)  # type: ignore[arg-type]
-    ticks = [tick for tick in _TIMES_S if low <= tick <= high]
-    across = Axis("time since failure T_dsf [s], linear about 0, logarithmic beyond", low, high, ticks, both_ways_log)
-    return plot(title, across, Axis("Pmd", 0.0, 1.0, (0.0, 0.2, 0.4, 0.6, 0.8, 1.0)), curves)
+    return pmd_plot(title, curves)
 
 
 def _time_to_detect(title: str, cells: pl.DataFrame) -> str:
