@@ -50,11 +50,11 @@ class Experiment:
             raise UsageError("takes no configuration", place=place, expected="the published settings", remedy=remedy)
         if recorded is not None and self.name != "rare":
             raise UsageError("takes no recorded noise", place=place, expected="`experiment rare`")
-        module = import_module(f"datasets.experiment.{self.name if recorded is None else 'rare_recorded'}")
+        module = import_module(f"datasets.experiment.{self.name}")
         count = repetitions or module.REPETITIONS
         settings = {"experiment": self.name, "repetitions": count, "seed": seed} | getattr(module, "SETTINGS", {})
-        noise = () if recorded is None else (recorded,)
-        return write(out, module.made(*noise, count, seed, jobs, config), settings)
+        noise = {} if recorded is None else {"recorded": recorded}
+        return write(out, module.made(count, seed, jobs, config, **noise), settings)
 
 
 EXPERIMENTS: dict[str, Experiment] = {

@@ -14,12 +14,9 @@ from pathlib import Path
 import polars as pl
 import pyarrow.parquet as pq
 
-from datasets.experiment.recorded.baseline import Baseline, baseline_of
-from datasets.experiment.recorded.draw import Onset, Room, numbered, onsets_of, room_of
-from datasets.experiment.recorded.injection import injected
-from datasets.experiment.recorded.outcome import outcome_row
-from datasets.experiment.recorded.page import recorded_page, remarks_on
-from datasets.experiment.recorded.pictures import pictures
+from datasets.experiment.recorded.baseline import Baseline, Onset, Room, baseline_of, numbered, onsets_of, room_of
+from datasets.experiment.recorded.outcome import injected, outcome_row
+from datasets.experiment.recorded.page import pictures, recorded_page, remarks_on
 from datasets.experiment.recorded.plan import Bank, Cell, RecordedPlan, banks_of, load_plan
 from datasets.experiment.recorded.tables import Quiet, banks_table, cells_table, places_table, pmd_table
 from datasets.experiment.tables import Row

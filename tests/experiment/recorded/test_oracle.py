@@ -8,10 +8,8 @@ import numpy as np
 import polars as pl
 import pytest
 
-from datasets.experiment.recorded.baseline import Baseline, baseline_of
-from datasets.experiment.recorded.draw import Onset, numbered, onsets_of, room_of
-from datasets.experiment.recorded.injection import Injected, injected
-from datasets.experiment.recorded.outcome import outcome_row
+from datasets.experiment.recorded.baseline import Baseline, Onset, baseline_of, numbered, onsets_of, room_of
+from datasets.experiment.recorded.outcome import Injected, injected, outcome_row
 from datasets.experiment.recorded.plan import Bank, PlannedFault, RecordedPlan
 from datasets.experiment.tables import Row
 from datasets.faults import FaultKind
