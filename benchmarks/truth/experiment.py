@@ -19,8 +19,7 @@ from datasets.experiment.bank import BankSpec, linear_bank
 from datasets.experiment.catalogue import run_catalogue
 from datasets.experiment.diagnostics import REPETITIONS, run_diagnostics
 from datasets.experiment.geometry import CONSTELLATIONS, Constellation, default_geometry
-from datasets.experiment.passage import BLOCK_EPOCHS, first_passages
-from datasets.experiment.plan import ExperimentPlan, bank_forms, failure_forms
+from datasets.experiment.monte_carlo import BLOCK_EPOCHS, ExperimentPlan, bank_forms, failure_forms, first_passages
 from datasets.experiment.range_system import RangePlan, range_system
 from datasets.experiment.sampling import Probability, missed_detection_probability
 from datasets.experiment.workers import generator

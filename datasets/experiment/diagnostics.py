@@ -16,8 +16,14 @@ import polars as pl
 
 from datasets.experiment.figures import drawn_figures
 from datasets.experiment.geometry import CONSTELLATIONS, PLACE, Geometry, default_geometry
-from datasets.experiment.passage import NEVER, FirstPassages, first_passages
-from datasets.experiment.plan import ExperimentPlan, bank_forms, failure_forms
+from datasets.experiment.monte_carlo import (
+    NEVER,
+    ExperimentPlan,
+    FirstPassages,
+    bank_forms,
+    failure_forms,
+    first_passages,
+)
 from datasets.experiment.tables import Contents, Row, share, table, time_columns
 from datasets.experiment.workers import in_pieces
 from schemas.arrays import Bools, Ints

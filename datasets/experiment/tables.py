@@ -12,7 +12,7 @@ import polars as pl
 from polars import selectors as cs
 
 from pipeline import storage
-from pipeline.stages.run_row.bounds import CONFIDENCE, clopper_pearson
+from pipeline.stages.run_row.bounds import CONFIDENCE, clopper_pearson, columns_of
 from pipeline.storage.described import noted_bytes
 from schemas.arrays import Floats
 from schemas.version import SOFTWARE
@@ -24,8 +24,7 @@ Row = dict[str, object]
 
 def share(name: str, count: int, trials: int) -> Row:
     """`name`, `name_low` and `name_high`: a share and its exact bounds, null without trials."""
-    found = clopper_pearson(count, trials)
-    return {name: found.value, f"{name}_low": found.low, f"{name}_high": found.high}
+    return columns_of(name, clopper_pearson(count, trials))
 
 
 class Expected(NamedTuple):

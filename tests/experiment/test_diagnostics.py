@@ -6,11 +6,18 @@ import numpy as np
 import polars as pl
 import pytest
 
-from datasets.experiment import passage
+from datasets.experiment import monte_carlo
 from datasets.experiment.diagnostics import detection_times, run_diagnostics, simulate
 from datasets.experiment.geometry import CONSTELLATIONS, DEFAULT_NS, TAUS_S, default_geometry, geometry_at
-from datasets.experiment.passage import NEVER, NoisePaths, first_passages
-from datasets.experiment.plan import SIGNALS, ExperimentPlan, bank_forms, failure_forms
+from datasets.experiment.monte_carlo import (
+    NEVER,
+    SIGNALS,
+    ExperimentPlan,
+    NoisePaths,
+    bank_forms,
+    failure_forms,
+    first_passages,
+)
 from datasets.experiment.tables import expected
 from datasets.experiment.workers import generator
 from pipeline.stages.monitors.pseudorange import range_variances_m2
@@ -77,8 +84,8 @@ def test_first_passages_equal_those_of_naive_evaluation(probability: float) -> N
 def first_passages_from(plan: ExperimentPlan, basis: np.ndarray) -> np.ndarray:
     """The fast evaluation on a given path."""
     weights = NoisePaths(plan, 1, generator(0)).weights
-    watch = passage.FirstAnswers(plan, bank_forms(plan), failure_forms(plan), weights, basis.shape[2])
-    for begin, end in passage._blocks(plan.onset_s, plan.span_s, 4):
+    watch = monte_carlo.FirstAnswers(plan, bank_forms(plan), failure_forms(plan), weights, basis.shape[2])
+    for begin, end in monte_carlo._blocks(plan.onset_s, plan.span_s, 4):
         watch.after_onset(basis[begin:end], begin)
     return watch.first[: len(plan.questions)]
 
@@ -87,8 +94,8 @@ def test_failure_is_the_first_epoch_beyond_the_limit() -> None:
     plan = small_plan(rates_mps=(1.0, 5.0))
     paths = NoisePaths(plan, 15, generator(6))
     basis = np.concatenate([paths.advance(50).copy() for _ in range(plan.span_s // 50)])
-    watch = passage.FirstAnswers(plan, bank_forms(plan), failure_forms(plan), paths.weights, 15)
-    for begin, end in passage._blocks(plan.onset_s, plan.span_s, 4):
+    watch = monte_carlo.FirstAnswers(plan, bank_forms(plan), failure_forms(plan), paths.weights, 15)
+    for begin, end in monte_carlo._blocks(plan.onset_s, plan.span_s, 4):
         watch.after_onset(basis[begin:end], begin)
     east_north = basis[:, -2:]
     elapsed = np.maximum(np.arange(1, plan.span_s + 1) - plan.onset_s, 0)
@@ -158,7 +165,7 @@ def test_results_do_not_depend_on_the_number_of_jobs() -> None:
 
 def test_tables_of_hand_made_passages() -> None:
     plan = small_plan(rates_mps=(1.0,), headings_deg=(0.0,), readings=("increments",), sensors=("odometer",))
-    passages = passage.FirstPassages(
+    passages = monte_carlo.FirstPassages(
         np.array([[[10, 20, 40, NEVER]]], dtype=np.int32),
         np.array([[[30, 30, 30, 30]]], dtype=np.int32),
         np.array([[False, True, False, False]]),

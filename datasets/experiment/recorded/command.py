@@ -27,6 +27,7 @@ from pipeline.read.site.read import read_site
 from pipeline.results.software import software_digest
 from pipeline.results.workers import mapped
 from pipeline.show.terminal import duration_text
+from pipeline.storage.described import noted_bytes
 from pipeline.storage.parquet import parquet_bytes
 from schemas.arrays import flags
 from schemas.config import Configuration, Vehicle, digest_of, load_settings, to_toml
@@ -384,21 +385,13 @@ def _together(bank: str, surveyed: Sequence[_Surveyed]) -> Quiet:
 def _write(out: Path, tables: dict[str, pl.DataFrame], plan: RecordedPlan) -> list[Path]:
     drawn = pictures(tables)
     contents = {PAGE: recorded_page(tables, drawn, plan).encode(), "plan.toml": to_toml(plan).encode()}
-    contents |= {f"{name}.parquet": _table_bytes(name, table) for name, table in tables.items()}
+    for name, frame in tables.items():
+        notes = {"table": f"experiment_{name}", "software": SOFTWARE}
+        contents[f"{name}.parquet"] = noted_bytes(frame, notes, EXPERIMENT_TABLES[notes["table"]])
     contents |= {f"{name}.svg": drawing.encode() for name, (_, drawing) in drawn.items()}
     for name, content in contents.items():
         storage.write_bytes(out / name, content)
     return [out / name for name in contents]
-
-
-def _table_bytes(name: str, table: pl.DataFrame) -> bytes:
-    """A table as Parquet, with unit and meaning in the field of each column."""
-    columns = EXPERIMENT_TABLES[f"experiment_{name}"].columns()
-    notes = {
-        column: {"unit": str((kind.metadata or {}).get("unit", "")), "meaning": kind.description or ""}
-        for column, kind in columns.items()
-    }
-    return parquet_bytes(table, {"balise.table": f"experiment_{name}", "balise.software": SOFTWARE}, notes)
 
 
 def _forget_others(pieces: Sequence[_Piece], out: Path) -> None:

@@ -112,16 +112,13 @@ def _cut(frame: pl.DataFrame | None, begin_ns: int, end_ns: int) -> pl.DataFrame
 class Watch:
     """The epochs of an injected run from a little before the onset on, beside those of the fault-free run.
 
-    `moved_m`: by what the fault has moved the position in the direction of travel, NaN where not known; `low_m`,
-    `high_m`: the error; `code`: the judgement; `doubtful`: it may be wrong, and by the fault; `begin`: the first epoch
-    of the fault.
+    `moved_m`: by what the fault has moved the position in the direction of travel, NaN where not known; `code`:
+    the judgement; `doubtful`: it may be wrong, and by the fault; `begin`: the first epoch of the fault.
     """
 
     epochs: pl.DataFrame
     t_ns: Ints
     moved_m: Floats
-    low_m: Floats
-    high_m: Floats
     code: Ints
     doubtful: Bools
     begin: int
@@ -171,18 +168,25 @@ def _watch(base: Baseline, onset: Onset, found: Injected) -> Watch:
     same = base.t_ns[row] == t_ns
     moved_m, astray = _moved_m(base, found, epochs, row)
     moved_m = np.where(same, moved_m, np.nan)
-    own_low_m, own_high_m = (values[row] for values in base.own_m)
-    low_m = own_low_m + moved_m
-    high_m = own_high_m + moved_m
+    code = _codes(base, row, moved_m, astray & holds(epochs, unambiguous()))
+    was_right = _codes(base, row, np.zeros(row.size), np.zeros(row.size, dtype=bool)) == RIGHT
+    beyond = np.abs(moved_m) > base.config.hazards.limits.failure_m
+    doubtful = (code == UNKNOWN) & np.isfinite(moved_m) & (was_right | beyond)
+    return Watch(epochs, t_ns, moved_m, code, doubtful, int(np.searchsorted(t_ns, onset.t_ns)))
+
+
+def _codes(base: Baseline, row: Ints, moved_m: Floats, astray: Bools) -> Ints:
+    """Judgement of positions at these rows of the fault-free run that the fault has moved; wrong where `astray`.
+
+    The error is an interval: the position's own, by its evidence, and what the fault has added.
+    """
+    low_m, high_m = (own_m[row] + moved_m for own_m in base.own_m)
     limit_m = base.config.hazards.limits.failure_m
-    code = np.full(t_ns.size, UNKNOWN)
-    with np.errstate(invalid="ignore"):
-        code[(low_m >= -limit_m) & (high_m <= limit_m)] = RIGHT
-        code[(low_m > limit_m) | (high_m < -limit_m)] = WRONG
-    code[astray & holds(epochs, unambiguous())] = WRONG
-    was_right = (own_low_m >= -limit_m) & (own_high_m <= limit_m)
-    doubtful = (code == UNKNOWN) & np.isfinite(moved_m) & (was_right | (np.abs(moved_m) > limit_m))
-    return Watch(epochs, t_ns, moved_m, low_m, high_m, code, doubtful, int(np.searchsorted(t_ns, onset.t_ns)))
+    code = np.full(row.size, UNKNOWN)
+    # Comparisons with NaN, an error not known, are false.
+    code[(low_m >= -limit_m) & (high_m <= limit_m)] = RIGHT
+    code[(low_m > limit_m) | (high_m < -limit_m) | astray] = WRONG
+    return code
 
 
 def _moved_m(base: Baseline, found: Injected, epochs: pl.DataFrame, row: Ints) -> tuple[Floats, Bools]:
@@ -253,19 +257,13 @@ def _accepted(base: Baseline, onset: Onset, found: Injected) -> Row:
     train_m, sense = _train_at(base, t_ns, row)
     at_m, astray = _moved_m(base, found, accepted, row)
     at_m = at_m * sense + floats(base.epochs, "path_m")[row]
-    own_low_m, own_high_m = (values[row] for values in base.own_m)
-    moved_m = (at_m - train_m) * sense
-    limit_m = base.config.hazards.limits.failure_m
-    low_m = own_low_m + moved_m
-    high_m = own_high_m + moved_m
-    wrong = (low_m > limit_m) | (high_m < -limit_m) | astray
-    right = (low_m >= -limit_m) & (high_m <= limit_m)
+    code = _codes(base, row, (at_m - train_m) * sense, astray)
     ids = accepted["balise_id"]
     return {
         "accepted": accepted.height,
-        "accepted_wrong": int(wrong.sum()),
-        "accepted_unknown": int((~wrong & ~right).sum()),
-        "accepted_wrong_ids": ids.filter(pl.Series(wrong, dtype=pl.Boolean)).to_list(),
+        "accepted_wrong": int((code == WRONG).sum()),
+        "accepted_unknown": int((code == UNKNOWN).sum()),
+        "accepted_wrong_ids": ids.filter(pl.Series(code == WRONG, dtype=pl.Boolean)).to_list(),
     }
 
 
