@@ -9,6 +9,7 @@ from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from schemas.errors import UsageError
 from schemas.frozen import frozen
 
 if TYPE_CHECKING:
@@ -42,7 +43,6 @@ class Experiment:
         the experiment does not take what is given.
         """
         from datasets.experiment.tables import write
-        from schemas.errors import UsageError
 
         place = f"experiment {self.name}"
         if config is not None and not self.configured:
@@ -58,15 +58,10 @@ class Experiment:
 
 
 EXPERIMENTS: dict[str, Experiment] = {
-    one.name: one
-    for one in (
-        Experiment("diagnostics", configured=False),
-        Experiment("rare", configured=True),
-        Experiment("catalogue", configured=True),
-    )
+    "diagnostics": Experiment("diagnostics", configured=False),
+    "rare": Experiment("rare", configured=True),
+    "catalogue": Experiment("catalogue", configured=True),
 }
-
-
 RECORDED = "recorded"
 """The one on the user's own recordings: it takes runs and a site (`datasets.experiment.recorded`)."""
 
@@ -76,7 +71,6 @@ def experiment_of(name: str, on_recordings: bool = False) -> Experiment:
 
     `on_recordings`: runs or what belongs to them were named, which only `recorded` takes.
     """
-    from schemas.errors import UsageError
     from schemas.near import did_you_mean
 
     if name not in EXPERIMENTS:

@@ -17,7 +17,7 @@ from scipy.linalg import solve_discrete_lyapunov
 from scipy.special import log_ndtr, ndtri_exp
 
 from datasets.experiment.geometry import SOURCES, TAUS_S, Geometry
-from datasets.experiment.sampling import Limits
+from datasets.experiment.sampling import Limits, root_of
 from schemas.arrays import Bools, Floats
 from schemas.config import MonitorConfig, threshold_factor
 from schemas.frozen import frozen
@@ -119,7 +119,7 @@ class LinearBank:
             return np.broadcast_to(self.covariance, (epochs + 1, states, states))
         pushed = self.noise @ self.noise.T
         current = np.zeros((states, states))
-        # At a restart the position errors go on as they were, and the monitors have seen nothing.
+        # At a restart the position errors go on as they were, and the averages begin at zero.
         current[: self.sources, : self.sources] = self.covariance[: self.sources, : self.sources]
         result = np.empty((epochs + 1, states, states))
         age = round(self.spec.age_s * self.spec.rate_hz)
@@ -138,19 +138,16 @@ class LinearBank:
         """k_T sigma at epochs 1 .. n of the fault [m/s], (epochs, monitors)."""
         return threshold_factor(self.spec.false_alarm_probability) * self.sigmas(epochs)
 
-    def response(self, epochs: int) -> Floats:
-        """To a range ramp of 1 m/s that starts at epoch 0, at epochs 1 .. n; shape (epochs, monitors)."""
-        k = np.arange(1, epochs + 1)[:, None]
-        return np.asarray((1.0 - (1.0 - self.alpha) ** k) * self.slope)
-
     def ramp(self, epochs: int, rate_mps: float) -> Floats:
-        return rate_mps * self.response(epochs)
+        """An average answers a range ramp that starts at epoch 0 with 1 - (1 - alpha)^k of its final value."""
+        k = np.arange(1, epochs + 1)[:, None]
+        return rate_mps * np.asarray((1.0 - (1.0 - self.alpha) ** k) * self.slope)
 
     def limits(self, epochs: int, rate_mps: float) -> Limits:
         towards = np.where(self.slope < 0, -1.0, 1.0)
         return Limits(self.ramp(epochs, rate_mps), self.thresholds(epochs), self.sigmas(epochs), towards)
 
-    def seen(self, values: Floats) -> Floats:
+    def on_limits(self, values: Floats) -> Floats:
         return values
 
     def towards_limit(self, epochs: int) -> Callable[[int, int], Floats]:
@@ -209,13 +206,9 @@ class LinearBank:
         return int((np.abs(path) > self.threshold).sum())
 
     def start(self, runs: int, rng: np.random.Generator) -> Floats:
-        """States at the fault's onset, shape (states, runs)."""
-        values, vectors = np.linalg.eigh(self.covariances(0)[0])
-        root = vectors * np.sqrt(np.maximum(values, 0.0))
-        return np.asarray(root @ rng.standard_normal((values.size, runs)))
+        return np.asarray(root_of(self.covariances(0)[0]) @ rng.standard_normal((len(self.advance), runs)))
 
     def following(self, state: Floats, rng: np.random.Generator) -> Floats:
-        """States at the next epoch."""
         following = self.advance @ state
         following += self.noise @ rng.standard_normal((self.noise.shape[1], state.shape[1]))
         return np.asarray(following)

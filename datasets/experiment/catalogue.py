@@ -222,23 +222,23 @@ def _replayed(
 def judged(ready: Stage, tables: RunTables, healthy: RunTables | None, config: Configuration) -> Row:
     """What one replay shows of the fault; times from its onset.
 
-    `seen_s`: by monitor when it first failed; `first`: those that failed at the first of these epochs, loudest first.
-    Without a healthy replay beside it every failure counts. `failure_s`: first epoch with an along-track error beyond
-    the limit. `unsafe`: balises accepted beyond it.
+    `seen_s`: by monitor when it first failed; `first`: those that failed at the first of these epochs, the largest
+    over its threshold first. Without a healthy replay every failure counts. `failure_s`: first epoch with an
+    along-track error beyond the limit. `unsafe`: balises accepted beyond it.
     """
     epochs = _from_onset(tables.epochs, ready)
-    beside = healthy.epochs if healthy is not None else tables.epochs.clear()
-    seen = _first_fails(epochs, _from_onset(beside, ready))
-    detected_s = min(seen.values(), default=None)
+    without_fault = healthy.epochs if healthy is not None else tables.epochs.clear()
+    failed_s = _first_fails(epochs, _from_onset(without_fault, ready))
+    detected_s = min(failed_s.values(), default=None)
     beyond = epochs.filter(pl.col("error_along_m").abs() > config.hazards.limits.failure_m)
     return {
         "detected_s": detected_s,
-        "way_m": None if detected_s is None else _way_m(ready, detected_s),
-        "first": _loudest(epochs, seen, detected_s),
+        "way_m": None if detected_s is None else _travelled_m(ready, detected_s),
+        "first": _failed_first(epochs, failed_s, detected_s),
         "failure_s": beyond["since_s"][0] if beyond.height else None,
         "unsafe": _unsafe(tables, ready, config) - (_unsafe(healthy, ready, config) if healthy else 0),
         "linking_errors": _linking_errors(tables) - (_linking_errors(healthy) if healthy else 0),
-        "seen_s": [seen.get(monitor) for monitor in MONITORS],
+        "seen_s": [failed_s.get(monitor) for monitor in MONITORS],
         "budget_s": config.budget_s,
         "reaction_s": config.hazards.reaction_s if config.hazards.reaction_s is not None else 1.0 / RATE_HZ,
     }
@@ -264,17 +264,17 @@ def _first_fails(epochs: pl.DataFrame, healthy: pl.DataFrame) -> dict[str, float
     return found
 
 
-def _loudest(epochs: pl.DataFrame, seen: dict[str, float], detected_s: float | None) -> list[str]:
-    """Monitors that failed first, by their value over the threshold."""
+def _failed_first(epochs: pl.DataFrame, failed_s: dict[str, float], detected_s: float | None) -> list[str]:
+    """Monitors that failed first, the largest value over its threshold first."""
     if detected_s is None:
         return []
     row = epochs.row(by_predicate=pl.col("since_s") == detected_s, named=True)
-    first = [monitor for monitor, since_s in seen.items() if since_s == detected_s]
+    first = [monitor for monitor, since_s in failed_s.items() if since_s == detected_s]
     return sorted(first, key=lambda monitor: -abs(row[f"{monitor}_value"]) / row[f"{monitor}_threshold"])
 
 
-def _way_m(ready: Stage, since_s: float) -> float:
-    """Way of the train from the onset to the detection [m]."""
+def _travelled_m(ready: Stage, since_s: float) -> float:
+    """Distance of the train from the onset to the detection [m]."""
     motion = build_motion(ready.scenario.runs[0].motion)
     begin_s = ready.plan.onset_s
     at = motion.distance_m(pl.Series([begin_s, begin_s + since_s]).to_numpy())

@@ -33,7 +33,7 @@ _VELOCITY = ("vel_e_mps", "vel_n_mps", "vel_u_mps")
 class CatalogueFault:
     """One fault from the onset on. `injected`: faults of a scenario (times from the onset); `change`: the rest.
 
-    `journey`: short suffices for all but slow drifts; `physical` has balises that are read beside virtual ones.
+    `journey`: short suffices for all but slow drifts; `physical` has physical balises besides virtual ones.
     """
 
     kind: str

@@ -49,9 +49,9 @@ def _fault_row(runs: pl.DataFrame) -> Row:
 
 
 def _ranking(found: pl.DataFrame) -> list[tuple[str, float]]:
-    """Monitors by the share of detections that they were the first or loudest of the first of."""
-    loudest = found.select(monitor=pl.col("first").list.first())
-    counted = loudest.group_by("monitor").len().sort(["len", "monitor"], descending=[True, False])
+    """Monitors by the share of detections in which they failed first, or with the largest value of those that did."""
+    leading = found.select(monitor=pl.col("first").list.first())
+    counted = leading.group_by("monitor").len().sort(["len", "monitor"], descending=[True, False])
     return [(str(name), count / found.height) for name, count in counted.iter_rows()]
 
 
@@ -76,11 +76,11 @@ def _monitor_row(monitor: str, place: int, runs: list[list[float | None]]) -> Ro
     leads = []
     first = 0
     alone = 0
-    for seen in runs:
-        mine = seen[place]
+    for first_fails in runs:
+        mine = first_fails[place]
         if mine is None:
             continue
-        others = min((s for k, s in enumerate(seen) if k != place and s is not None), default=None)
+        others = min((s for k, s in enumerate(first_fails) if k != place and s is not None), default=None)
         own.append(mine)
         alone += others is None
         first += others is None or others >= mine

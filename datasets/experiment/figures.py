@@ -1,15 +1,16 @@
-"""The published figures (DIAG Fig. 4 to 7) as SVG, from the tables of the experiment."""
+"""The published figures (DIAG Fig. 4 to 7) as SVG; that of Pmd serves the experiment on recorded runs too."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from itertools import product
 from math import cos, log10, radians, sin
 
 import polars as pl
 
 from datasets.experiment.bank import READINGS, SENSORS
-from datasets.experiment.drawing import COLOURS, HEIGHT, WIDTH, Axis, Curve, even_ticks, plot, pmd_plot, svg, text
 from datasets.experiment.geometry import CONSTELLATIONS
+from pipeline.show.svg_plot import COLOURS, HEIGHT, WIDTH, Axis, Curve, both_ways_log, even_ticks, plot, svg, text
 
 _NAMES = {"gps": "GPS", "gps_galileo": "GPS + Galileo"}
 _SENSOR_NAMES = {"odometer": "odometer only", "odometer_and_track": "with track"}
@@ -19,6 +20,7 @@ _SINCE_RATES_MPS = (0.03, 0.1, 1.0)
 _DETECT_S = (1.0, 10.0, 100.0, 1_000.0, 10_000.0)
 _HEADINGS = Axis("heading [deg]", 0.0, 75.0, (0.0, 15.0, 30.0, 45.0, 60.0, 75.0))
 _HORIZON = 0.42 * HEIGHT
+_TIMES_S = (-3000.0, -1000.0, -300.0, -100.0, -30.0, -10.0, -3.0, 0.0, 3.0, 10.0, 30.0, 100.0, 300.0)
 
 
 def drawn_figures(pmd: pl.DataFrame, detection: pl.DataFrame, geometry: pl.DataFrame) -> dict[str, str]:
@@ -34,6 +36,15 @@ def drawn_figures(pmd: pl.DataFrame, detection: pl.DataFrame, geometry: pl.DataF
 
 def _points(frame: pl.DataFrame, *columns: str) -> list[tuple[float, float]]:
     return list(frame.select(columns).iter_rows())
+
+
+def pmd_plot(title: str, curves: Sequence[Curve]) -> str:
+    """Pmd over the time since failure [s] (DIAG Fig. 5), the axis at least from -1 to 1 s."""
+    times_s = [time_s for curve in curves for time_s, _ in curve.points]
+    low, high = min([-1.0, *times_s]), max([1.0, *times_s])
+    ticks = [tick for tick in _TIMES_S if low <= tick <= high]
+    times = Axis("time since failure T_dsf [s], linear about 0, logarithmic beyond", low, high, ticks, both_ways_log)
+    return plot(title, times, Axis("Pmd", 0.0, 1.0, (0.0, 0.2, 0.4, 0.6, 0.8, 1.0)), curves)
 
 
 def _pmd_figure(pmd: pl.DataFrame, reading: str) -> str:

@@ -279,7 +279,10 @@ class NoisePaths:
 
 
 class FirstAnswers:
-    """Keeps, for every question, rate and repetition, when it was first answered."""
+    """Keeps, for every question, rate and repetition, when it was first answered.
+
+    `first` (questions, rates, repetitions): seconds from onset to the first passage.
+    """
 
     def __init__(self, plan: ExperimentPlan, banks: Forms, failures: Forms, weights: Floats, repetitions: int) -> None:
         self._plan = plan
@@ -292,13 +295,8 @@ class FirstAnswers:
         self._failure_limit = failures.threshold[0]
         self._slope = np.concatenate([banks.slope, failures.slope])
         self._monitors = banks.slope.size
-        self._first = np.full((len(members), self._rates.size, repetitions), NEVER, dtype=np.int32)
+        self.first = np.full((len(members), self._rates.size, repetitions), NEVER, dtype=np.int32)
         self.alarmed = np.zeros((banks.members.shape[0], repetitions), dtype=np.bool_)
-
-    @property
-    def first(self) -> Seconds:
-        """Seconds from onset to the first passage, shape (questions, rates, repetitions)."""
-        return self._first
 
     def thresholds(self, begin: int, end: int) -> Floats:
         """Of epochs begin+1 .. end, shape (epochs, forms)."""
@@ -331,7 +329,7 @@ class FirstAnswers:
         high, low = self._envelope(basis)
         least = threshold.min(axis=0)[:, None]
         slowest = (least - high) / response[-1][:, None]
-        largest_open = np.where(self._first == NEVER, self._rates[:, None], -np.inf).max(axis=1)
+        largest_open = np.where(self.first == NEVER, self._rates[:, None], -np.inf).max(axis=1)
         for question, asked in enumerate(self._forms):
             waiting = largest_open[question]
             possible = (slowest[asked] <= waiting) | ((low[asked] < -least[asked]) & (waiting > 0.0))
@@ -349,12 +347,12 @@ class FirstAnswers:
         with_ramp = ((threshold - values) / response).min(axis=1)
         against = -((threshold + values) / response).min(axis=1)
         for index, rate in enumerate(self._rates):
-            waiting = self._first[question, index, runs] == NEVER
+            waiting = self.first[question, index, runs] == NEVER
             if waiting.any():
                 failing = (with_ramp < rate) | (against > rate)
                 found = failing.any(axis=0) & waiting
                 when = failing.argmax(axis=0) + begin + 1 - self._plan.onset_s
-                self._first[question, index, runs[found]] = when[found]
+                self.first[question, index, runs[found]] = when[found]
 
     def _envelope(self, basis: Floats) -> tuple[Floats, Floats]:
         """Upper and lower bound of every form over the block."""

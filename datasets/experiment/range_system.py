@@ -17,7 +17,7 @@ import numpy as np
 from scipy.special import chdtr, chdtri
 
 from datasets.experiment.geometry import TAUS_S, Geometry
-from datasets.experiment.sampling import Limits
+from datasets.experiment.sampling import Limits, root_of
 from pipeline.stages.monitors.pseudorange import clock_columns, line_of_sight_rows
 from schemas.arrays import Bools, Floats
 from schemas.frozen import frozen
@@ -98,11 +98,10 @@ class RangeSystem:
 
     def start(self, runs: int, rng: np.random.Generator) -> Floats:
         """States at the onset: sources, then the survey, d rows each; (states, runs)."""
-        parts = [_root(one) @ rng.standard_normal((self.size, runs)) for one in (*self.covariance, self.survey)]
+        parts = [root_of(one) @ rng.standard_normal((self.size, runs)) for one in (*self.covariance, self.survey)]
         return np.concatenate(parts)
 
     def following(self, state: Floats, rng: np.random.Generator) -> Floats:
-        """States at the next recorded epoch."""
         sources = len(self.phi)
         moving = state.reshape(sources + 1, self.size, -1).copy()
         fresh = rng.standard_normal((sources, self.size, state.shape[1]))
@@ -112,7 +111,7 @@ class RangeSystem:
 
     @cached_property
     def _push(self) -> Floats:
-        push: Floats = np.sqrt(1.0 - self.phi**2)[:, None, None] * np.array([_root(one) for one in self.covariance])
+        push: Floats = np.sqrt(1.0 - self.phi**2)[:, None, None] * np.array([root_of(one) for one in self.covariance])
         return push
 
     def values(self, state: Floats) -> Floats:
@@ -126,9 +125,9 @@ class RangeSystem:
         """Along the ramp alone: what the other directions take of the ball on average is not there for it."""
         radius = np.sqrt(max(self.threshold - (self.size - 1), 1.0))
         one = np.ones((epochs, 1))
-        return Limits(self.seen(self.ramp(epochs, rate_mps)), radius * one, one, np.ones(1))
+        return Limits(self.on_limits(self.ramp(epochs, rate_mps)), radius * one, one, np.ones(1))
 
-    def seen(self, values: Floats) -> Floats:
+    def on_limits(self, values: Floats) -> Floats:
         return np.asarray(values @ self._along)[..., None]
 
     @cached_property
@@ -151,12 +150,6 @@ class RangeSystem:
 
     def fails(self, path: Floats) -> int:
         return int((np.square(path).sum(axis=1) > self.threshold).sum())
-
-
-def _root(covariance: Floats) -> Floats:
-    """A matrix with this covariance, which may be singular (the survey's has two dimensions)."""
-    values, vectors = np.linalg.eigh(covariance)
-    return np.asarray(vectors * np.sqrt(np.maximum(values, 0.0)))
 
 
 def range_system(plan: RangePlan, heading_deg: float) -> RangeSystem:

@@ -158,7 +158,7 @@ def _bank_row(constellation: Constellation, spec: BankSpec) -> Row:
 
 
 def transient_table(runs: int, seed: int, jobs: int, config: Configuration | None) -> pl.DataFrame:
-    """Pmd of a fault that begins soon after a restart beside one long after, at the time that makes the latter 1e-4.
+    """Pmd of a fault that begins soon after a restart, and of one long after, at the time that makes the latter 1e-4.
 
     Thresholds are exact at every age (DOMAIN section 3), so false alarms do not depend on it; misses do.
     """

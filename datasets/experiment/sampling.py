@@ -95,8 +95,8 @@ class System(Protocol):
     def limits(self, epochs: int, rate_mps: float) -> Limits:
         """Half-spaces around all values without a fail."""
 
-    def seen(self, values: Floats) -> Floats:
-        """Of (..., values) what the limits hold, (..., limits)."""
+    def on_limits(self, values: Floats) -> Floats:
+        """What each limit bounds, of `values` (..., values): (..., limits)."""
 
     def towards_limit(self, epochs: int) -> Callable[[int, int], Floats]:
         """Covariance of the values at epochs 1 .. n with a limit at an epoch (from 1), (epochs, values)."""
@@ -114,6 +114,12 @@ class System(Protocol):
 
     def fails(self, path: Floats) -> int:
         """Fails of one run, (epochs, values)."""
+
+
+def root_of(covariance: Floats) -> Floats:
+    """A matrix R with R R' = `covariance` (n, n), which may be singular."""
+    values, vectors = np.linalg.eigh(covariance)
+    return np.asarray(vectors * np.sqrt(np.maximum(values, 0.0)))
 
 
 class Probability(NamedTuple):
@@ -247,7 +253,7 @@ def _shift(system: System, limits: Limits, margin: float, towards_limit: Callabl
     multiplier = np.zeros(0)
     gram = np.zeros((0, 0))
     for _ in range(_MOST_CONSTRAINTS):
-        excess = (towards * (ramp + system.seen(mean)) - threshold) / sigma
+        excess = (towards * (ramp + system.on_limits(mean)) - threshold) / sigma
         worst = np.unravel_index(int(excess.argmax()), excess.shape)
         if excess[worst] < -0.5 * margin:
             break
@@ -256,7 +262,7 @@ def _shift(system: System, limits: Limits, margin: float, towards_limit: Callabl
         columns.append(towards[worst[1]] * towards_limit(limit[-1], epoch[-1]))
         at = np.array(epoch) - 1
         which = np.array(limit)
-        gram = np.array([(towards[which] * system.seen(column)[at, which]) for column in columns])
+        gram = np.array([(towards[which] * system.on_limits(column)[at, which]) for column in columns])
         needed = towards[which] * ramp[at, which] - threshold[at, which] + margin * sigma[at, which]
         multiplier = least_norm(gram, needed)
         mean = -np.einsum("c,ckm->km", multiplier, np.array(columns))
@@ -286,7 +292,7 @@ def miss_estimate(
         weight = np.where(passing(k, noise + moved[k][:, None]), 0.0, -np.inf)
         # Density of the true noise over that of the shifted one: exp(l' m - l' C l / 2), m the noise at constraints.
         for index in np.flatnonzero(shift.epoch == k + 1):
-            weight += shift.multiplier[index] * system.seen(noise.T)[:, shift.limit[index]]
+            weight += shift.multiplier[index] * system.on_limits(noise.T)[:, shift.limit[index]]
         return following, weight
 
     return float(np.exp(log_survival(system.start(runs, rng), step, epochs, rng) - shift.half_square))

@@ -94,7 +94,7 @@ def test_a_single_gaussian_miss_has_its_exact_probability() -> None:
     """Raw monitor alone, one epoch: P(|m + r| < T) by the normal distribution, at 1e-9 and beyond."""
     system = bank(alphas=(1.0,))
     for rate in (2.0, 3.5):
-        shift = rate * system.response(1)[0, 0] / system.sigma[0]
+        shift = system.ramp(1, rate)[0, 0] / system.sigma[0]
         factor = system.threshold[0] / system.sigma[0]
         exact = ndtr(factor - shift) - ndtr(-factor - shift)
         result = missed_detection_probability(system, 1, rate, runs=4000, seed=6)
@@ -106,7 +106,7 @@ def test_a_single_gaussian_miss_has_its_exact_probability() -> None:
 def test_the_most_probable_miss_stays_inside_the_thresholds() -> None:
     system = bank(sensors="odometer_and_track", reading="position")
     shift = most_probable_miss(system, 150, 0.2)
-    path = shift.mean + 0.2 * system.response(150)
+    path = shift.mean + system.ramp(150, 0.2)
     assert (np.abs(path) <= system.threshold * 1.001).all()
     assert shift.half_square > 0
 

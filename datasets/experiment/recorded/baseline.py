@@ -31,8 +31,20 @@ from schemas.frozen import frozen
 from schemas.run import RunLog, Site
 
 _REASONS = tuple(LeftOut)
-# Satellites must stand beside so many of the positions: a range fault moves only these.
-_RANGES_BESIDE = 0.99
+# Share of the positions that must have satellites: a range fault moves only these.
+_SHARE_WITH_RANGES = 0.99
+
+
+@frozen
+class FaultFree:
+    """One bank on recorded runs without a fault: alarms in so many hours, time with a TVB and in all."""
+
+    bank: str
+    runs: int
+    hours: float
+    alarms: int
+    tvb_s: float
+    recorded_s: float
 
 
 @frozen
@@ -86,9 +98,12 @@ class Baseline:
     def clock(self) -> Clock:
         return Clock.of(self.epochs, self.config)
 
-    def hours(self) -> float:
-        """Time held by epochs at which an alarm could have begun [h]: none can while one stands."""
-        return float(self.clock.held_s[self.watched & ~self.alarming].sum()) / 3600.0
+    def fault_free(self) -> FaultFree:
+        """What this bank did on the run as it was recorded; no alarm can begin while one stands."""
+        held_s = self.clock.held_s
+        hours = float(held_s[self.watched & ~self.alarming].sum()) / 3600.0
+        tvb_s = float(held_s[flags(self.epochs, "tvb")].sum())
+        return FaultFree(self.bank.name, 1, hours, self.alarms.height, tvb_s, float(held_s.sum()))
 
     @cached_property
     def watched(self) -> Bools:
@@ -106,7 +121,7 @@ class Baseline:
         for why, where in (
             (LeftOut.NOT_RIGHT, doubtful),
             (LeftOut.NO_TVB, ~flags(self.epochs, "tvb") | after_gap),
-            (LeftOut.AMBIGUOUS, ~holds(self.epochs, unambiguous()) & floats_known(self.epochs, "path_m")),
+            (LeftOut.AMBIGUOUS, ~holds(self.epochs, unambiguous()) & self.epochs["path_m"].is_not_null().to_numpy()),
             (LeftOut.ALARM, self.alarming),
         ):
             reason[where] = _REASONS.index(why)
@@ -122,16 +137,11 @@ class Baseline:
 
     @cached_property
     def has_ranges(self) -> bool:
-        """Satellites stand beside nearly all positions, so that a range fault can move them."""
+        """Nearly all positions have satellites, so that a range fault can move them."""
         ranges = self.monitored.prepared.ranges(self.solution)
         if ranges is None or ranges.is_empty():
             return False
-        return float(np.isin(self.t_ns, times_ns(ranges)).mean()) >= _RANGES_BESIDE
-
-
-def floats_known(frame: pl.DataFrame, column: str) -> Bools:
-    """Where a nullable number is known."""
-    return frame[column].is_not_null().to_numpy()
+        return float(np.isin(self.t_ns, times_ns(ranges)).mean()) >= _SHARE_WITH_RANGES
 
 
 def _with_quiet(reason: Ints, t_ns: Ints, quiet_s: float) -> Ints:

@@ -110,7 +110,7 @@ def _cut(frame: pl.DataFrame | None, begin_ns: int, end_ns: int) -> pl.DataFrame
 
 @frozen
 class Watch:
-    """The epochs of an injected run from a little before the onset on, beside those of the fault-free run.
+    """The epochs of an injected run from a little before the onset on, compared with those of the fault-free run.
 
     `moved_m`: by what the fault has moved the position in the direction of travel, NaN where not known; `code`:
     the judgement; `doubtful`: it may be wrong, and by the fault; `begin`: the first epoch of the fault.
@@ -276,17 +276,12 @@ def _train_at(base: Baseline, t_ns: Ints, row: Ints) -> tuple[Floats, Ints]:
 
 
 def _what(onset: Onset, found: Injected) -> Row:
-    cell = onset.cell
     return {
+        **onset.cell.labels,
         "injection_id": onset.number,
-        "cell": cell.name,
         "run_id": onset.run_id,
         "solution": found.monitored.solution.name,
-        "kind": cell.fault.kind.value,
         "target": found.fault.target,
-        "direction": cell.direction,
-        "amount": cell.amount,
-        "unit": cell.fault.unit,
         "duration_s": found.fault.duration_s,
         "start_s": found.fault.start_s,
     }

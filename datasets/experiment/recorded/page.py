@@ -5,30 +5,28 @@ Pmd over T_dsf (DIAG Fig. 5), T_D over the rate, the line by how much it hides.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from html import escape
 from math import log10
 
 import polars as pl
 
-from datasets.experiment.drawing import COLOURS, Axis, Curve, plot, pmd_plot, svg, text
+from datasets.experiment.figures import pmd_plot
 from datasets.experiment.recorded.plan import RecordedPlan
 from datasets.faults import FaultKind
 from pipeline.show.report.columns import frame_table
 from pipeline.show.report.markup import page, script_json, section
+from pipeline.show.svg_plot import COLOURS, Axis, Curve, even_ticks, plot
 from schemas.enums import OwnError
 from schemas.experiment import ExperimentBanks, ExperimentCells, ExperimentPlaces, ExperimentRuns
 from schemas.version import SOFTWARE
 
 _DETECT_S = (0.1, 1.0, 10.0, 100.0, 1000.0, 10000.0)
 _TARGETS = {"along": "along the track", "cross": "across the track", "satellite": "in one satellite's range"}
-_STRIP_LEFT = 150.0
-_STRIP_WIDTH = 730.0
-_LANE = 20.0
-# From little to much.
-_SHADES = ("#e8eef5", "#b9cfe6", "#f3d9a4", "#e79a5b", "#c0392b")
-UNNOTICED_M = (2.0, 5.0, 10.0, 20.0)
-SLOWNESS = (0.8, 1.0, 1.25, 2.0)
+_ALONG_THE_LINE = (
+    ("line", "unnoticed_max_m", "largest unnoticed error [m]"),
+    ("slowness", "slowness", "slowness of detection, T_D over the median of its cell"),
+)
 _CELL_COLUMNS = (
     *("bank", "cell", "injections", "passes", "noticed_share", "time_to_detect_median_s", "time_to_detect_p95_s"),
     *("failures", "pmd_at_failure", "stopped", "noticed_not_stopped", "accepted_wrong", "hazardous_max_s"),
@@ -57,8 +55,9 @@ def pictures(tables: dict[str, pl.DataFrame]) -> dict[str, tuple[str, str]]:
         title = f"T_D over the rate: ramps, {_TARGETS.get(str(target), target)}"
         drawn[f"time_to_detect_{target}"] = title, _time_to_detect(title, part)
     for (bank,), places in tables["places"].group_by("bank", maintain_order=True):
-        title = f"The line: largest unnoticed error (upper lane) and slowness of detection (lower lane), {bank}"
-        drawn[f"line_{bank}"] = title, _strips(title, places)
+        for name, column, what in _ALONG_THE_LINE:
+            title = f"The line: {what}, {bank}"
+            drawn[f"{name}_{bank}"] = title, _line(title, places, column, what)
     return drawn
 
 
@@ -81,15 +80,10 @@ def _time_to_detect(title: str, cells: pl.DataFrame) -> str:
     curves = list(_detection_curves(cells))
     rates = cells["amount"].abs().unique().sort().to_list()
     longest_s = float(cells["watched_s"].max())  # type: ignore[arg-type]
+    ticks = [tick for tick in _DETECT_S if tick <= longest_s]
     across = Axis("rate [m/s]", rates[0] / 1.5, rates[-1] * 1.5, rates, log10)
-    up = Axis(
-        "T_D [s]: median and bounds; △ not noticed in the watch", 0.05, 2.0 * longest_s, _within(longest_s), log10
-    )
+    up = Axis("T_D [s]: median and bounds; △ not noticed in the watch", 0.05, 2.0 * longest_s, ticks, log10)
     return plot(title, across, up, curves)
-
-
-def _within(longest_s: float) -> list[float]:
-    return [tick for tick in _DETECT_S if tick <= longest_s]
 
 
 def _detection_curves(cells: pl.DataFrame) -> Iterator[Curve]:
@@ -103,7 +97,7 @@ def _detection_curves(cells: pl.DataFrame) -> Iterator[Curve]:
         unnoticed = part.filter(pl.col("time_to_detect_median_s").is_null())
         yield Curve(
             name=f"{bank}, {direction}",
-            # An epoch at which the fault is seen at once has no place on a logarithmic axis.
+            # An epoch at which the fault is noticed at once has no place on a logarithmic axis.
             points=[
                 (rate, max(time_s, 0.05))
                 for rate, time_s in known.select("rate", "time_to_detect_median_s").iter_rows()
@@ -115,54 +109,17 @@ def _detection_curves(cells: pl.DataFrame) -> Iterator[Curve]:
         )
 
 
-def _strips(title: str, places: pl.DataFrame) -> str:
-    """A row of two lanes per net element."""
-    ends = places.group_by("netelement_id").agg(pl.col("from_m").min(), pl.col("to_m").max())
-    longest_m = float((ends["to_m"] - ends["from_m"]).max())  # type: ignore[arg-type]
-    parts = []
-    top = 8.0
-    for (element,), part in places.group_by("netelement_id", maintain_order=True):
-        begin_m = float(part["from_m"].min())  # type: ignore[arg-type]
-        parts.append(text(8.0, top + 24.0, f"{element} from {begin_m:.0f} m"))
-        for row in part.iter_rows(named=True):
-            at = _STRIP_LEFT + (row["from_m"] - begin_m) / longest_m * _STRIP_WIDTH
-            width = (row["to_m"] - row["from_m"]) / longest_m * _STRIP_WIDTH - 0.6
-            words = _place_words(row)
-            parts.append(_block(at, top, width, row["unnoticed_max_m"], UNNOTICED_M, words))
-            parts.append(_block(at, top + _LANE, width, row["slowness"], SLOWNESS, words))
-        top += 2.0 * _LANE + 10.0
-    return svg(
-        title,
-        top + 44.0,
-        [*parts, *_shades(top + 8.0, "unnoticed [m]", UNNOTICED_M), *_shades(top + 26.0, "slowness", SLOWNESS)],
-    )
-
-
-def _place_words(row: dict[str, object]) -> str:
-    slowness = row["slowness"]
-    slow = "not known" if slowness is None else f"{slowness:.2f}"
-    return (
-        f"{row['from_m']:.0f} to {row['to_m']:.0f} m: {row['injections']} faults, {row['noticed']} noticed; "
-        f"up to {row['unnoticed_max_m']:.1f} m unnoticed; slowness {slow}"
-    )
-
-
-def _block(at: float, top: float, width: float, value: float | None, limits: Sequence[float], words: str) -> str:
-    colour = "#ffffff" if value is None else _SHADES[sum(value > limit for limit in limits)]
-    return (
-        f'<rect x="{at:.1f}" y="{top:.1f}" width="{max(width, 1.0):.1f}" height="{_LANE - 2:.0f}" fill="{colour}" '
-        f'stroke="#999999" stroke-width="0.5"><title>{escape(words)}</title></rect>'
-    )
-
-
-def _shades(top: float, what: str, limits: Sequence[float]) -> list[str]:
-    names = [f"to {limits[0]:g}", *(f"to {limit:g}" for limit in limits[1:]), f"over {limits[-1]:g}"]
-    parts = [text(8.0, top + 11.0, what)]
-    for number, (name, shade) in enumerate(zip(names, _SHADES, strict=True)):
-        at = _STRIP_LEFT + 110.0 * number
-        parts.append(f'<rect x="{at:.0f}" y="{top:.0f}" width="14" height="13" fill="{shade}" stroke="#999999"/>')
-        parts.append(text(at + 20.0, top + 11.0, name))
-    return parts
+def _line(title: str, places: pl.DataFrame, column: str, what: str) -> str:
+    """A line per net element through `column` in the middle of each of its pieces."""
+    known = places.drop_nulls(column).with_columns(middle_m=(pl.col("from_m") + pl.col("to_m")) / 2.0)
+    curves = [
+        Curve(str(element), list(part.select("middle_m", column).iter_rows()), COLOURS[number % len(COLOURS)])
+        for number, ((element,), part) in enumerate(known.group_by("netelement_id", maintain_order=True))
+    ]
+    longest_m = float(places["to_m"].max())  # type: ignore[arg-type]
+    most = max([1.0, *known[column].to_list()])
+    along = Axis("measure on the net element [m]", 0.0, longest_m, even_ticks(0.0, longest_m))
+    return plot(title, along, Axis(what, 0.0, most, even_ticks(0.0, most)), curves)
 
 
 def recorded_page(tables: Mapping[str, pl.DataFrame], drawn: Mapping[str, tuple[str, str]], plan: RecordedPlan) -> str:

@@ -98,7 +98,7 @@ class PlannedFault(Settings):
 
 
 class PlannedBank(Settings):
-    """A bank of the comparison: a configuration file, seen from the plan; `vehicle` in place of the command's."""
+    """A bank of the comparison: a configuration file, relative to the plan; `vehicle` in place of the command's."""
 
     name: Annotated[str, Field(pattern=r"^[A-Za-z0-9_.-]+$")]
     config: str
@@ -165,6 +165,12 @@ class Cell:
     def direction(self) -> str | None:
         """Where it moves the position, or the range; None where the fault has no direction."""
         return _direction(self.fault, self.target, self.amount)
+
+    @property
+    def labels(self) -> dict[str, object]:
+        """What names the cell in every table."""
+        named = {"cell": self.name, "kind": self.fault.kind.value, "target": self.target, "direction": self.direction}
+        return named | {"amount": self.amount, "unit": self.fault.unit}
 
     @property
     def hits_satellite(self) -> bool:

@@ -12,7 +12,6 @@ from schemas.frozen import frozen
 WIDTH, HEIGHT = 900.0, 420.0
 _LEFT, _RIGHT, _TOP, _BOTTOM = 62.0, 690.0, 16.0, 370.0
 COLOURS = ("#1f5fa8", "#c4561a", "#2b8a3e", "#7a3fa0", "#a1821a", "#0b7285", "#b02a4a", "#555555")
-_TIMES_S = (-3000.0, -1000.0, -300.0, -100.0, -30.0, -10.0, -3.0, 0.0, 3.0, 10.0, 30.0, 100.0, 300.0)
 
 Scale = Callable[[float], float]
 Point = tuple[float, float]
@@ -61,15 +60,6 @@ def even_ticks(low: float, high: float) -> list[float]:
     power = 10.0 ** floor(log10((high - low) / 10.0))
     step = next(power * factor for factor in (1.0, 2.0, 5.0, 10.0) if (high - low) / (power * factor) <= 10.0)
     return [step * number for number in range(ceil(low / step), floor(high / step) + 1)]
-
-
-def pmd_plot(title: str, curves: Sequence[Curve]) -> str:
-    """Pmd over the time since failure [s] (DIAG Fig. 5); `curves` with at least one point."""
-    times_s = [time_s for curve in curves for time_s, _ in curve.points]
-    low, high = min(*times_s, -1.0), max(*times_s, 1.0)
-    ticks = [tick for tick in _TIMES_S if low <= tick <= high]
-    times = Axis("time since failure T_dsf [s], linear about 0, logarithmic beyond", low, high, ticks, both_ways_log)
-    return plot(title, times, Axis("Pmd", 0.0, 1.0, (0.0, 0.2, 0.4, 0.6, 0.8, 1.0)), curves)
 
 
 def plot(title: str, x: Axis, y: Axis, curves: Sequence[Curve]) -> str:
