@@ -53,7 +53,7 @@ def measure(folder: Path) -> list[Figure]:
         figures += [
             Figure(f"{name}: normals of {_CHUNK} runs", drawing, "s"),
             Figure(f"{name}: grid of {_CHUNK} runs", grid, "s"),
-            Figure(f"{name}: grid over normals", grid / drawing, "1", target=2.5),
+            Figure(f"{name}: grid over normals", grid / drawing, "1", target=5.0),
         ]
     with stopwatch() as watch:
         run_diagnostics(_TENTH, jobs=_JOBS)

@@ -1,6 +1,10 @@
 """The published experiment at its own size, and what was added to it; `balise experiment NAME --out DIR`.
 
-Their names cost nothing; what an experiment needs is loaded when it is called.
+Their names cost nothing; what an experiment needs is loaded when it is called. `diagnostics` is the published one: a
+grid of ramps on simulated noise (`monte_carlo`, `figures`). `rare` asks what counting cannot reach (`sampling`), of the
+bank and of the pseudorange monitor (`range_system`). Both have the sky of `geometry` and the monitors of `bank`.
+`catalogue` replays faults (`catalogue_faults`, `catalogue_report`), `recorded` puts them into the user's own runs.
+`tables` writes the results, `workers` splits the work.
 """
 
 from __future__ import annotations

@@ -65,10 +65,12 @@ class BankSpec:
 
     @property
     def weights(self) -> tuple[float, ...]:
+        """Of the averages at 1 s, the raw monitor's first."""
         return self.alphas or PUBLISHED_WEIGHTS[self.reading]
 
     @property
     def weights_text(self) -> str:
+        """As they stand in tables."""
         return ", ".join(f"{alpha:g}" for alpha in self.weights)
 
 
@@ -218,7 +220,10 @@ class LinearBank:
 
 
 def linear_bank(geometry: Geometry, heading_deg: float, spec: BankSpec) -> LinearBank:
-    """The monitors of a fixed sky and heading (DIAG eq. 1-16); the fault is a ramp in the range of one satellite."""
+    """The monitors of a fixed sky and heading (DIAG eq. 1-16); the fault is a ramp in the range of one satellite.
+
+    `heading_deg`: clockwise from the faulty satellite on.
+    """
     vectors = geometry.axes(heading_deg)[: _MOST_AXES if spec.sensors == "odometer_and_track" else 1]
     covariances = np.einsum("ai,jik,bk->jab", vectors, geometry.source_covariances_m2, vectors)
     dt_s = 1.0 / spec.rate_hz

@@ -33,6 +33,12 @@ RATE_HZ = 1.0
 SETTINGS = {"rate_hz": RATE_HZ}
 _SOLUTION = "primary"
 _OTHER = "dual"
+# Columns of which no row may know anything.
+_NULLABLE: dict[str, pl.DataType | type[pl.DataType]] = {
+    **dict.fromkeys(("detected_s", "way_m", "failure_s"), pl.Float64),
+    "first": pl.List(pl.String),
+    "seen_s": pl.List(pl.Float64),
+}
 SPEED_MPS = 30.0
 # At this instant of the nominal almanac no satellite comes or goes above 10 degrees for the next 3 150 s: a change of
 # the sky is a step of the position, and the catalogue is about other steps.
@@ -75,14 +81,17 @@ class Stage:
 
     @property
     def vehicle(self) -> Vehicle:
+        """What the replay knows of the train."""
         return self.scenario.vehicle or Vehicle()
 
     @property
     def first_ns(self) -> int:
+        """First epoch [ns since 1970, UTC]."""
         return int(self.scenario.start.timestamp()) * 1_000_000_000
 
     @property
     def onset_ns(self) -> int:
+        """When the fault begins [ns since 1970, UTC]."""
         return self.first_ns + round(self.plan.onset_s * 1e9)
 
 
@@ -190,7 +199,7 @@ def run_catalogue(
     rows = [row for part in mapped(replayed, tasks, jobs) for row in part]
     order = {one.name: place for place, one in enumerate(faults)}
     rows.sort(key=lambda row: (order[str(row["fault"])], row["repetition"]))
-    return pl.DataFrame(rows, schema=_SCHEMA, orient="row")
+    return pl.DataFrame(rows, infer_schema_length=None, schema_overrides=_NULLABLE)
 
 
 def compared(config: Configuration) -> Configuration:
@@ -295,22 +304,3 @@ def _unsafe(tables: RunTables, ready: Stage, config: Configuration) -> int:
 def _linking_errors(tables: RunTables) -> int:
     ours = tables.passages.filter(pl.col("solution") == _SOLUTION)
     return ours.filter(pl.col("linking_error") != "none").height
-
-
-_SCHEMA: dict[str, pl.DataType | type[pl.DataType]] = {
-    "fault": pl.String,
-    "kind": pl.String,
-    "size": pl.Float64,
-    "unit": pl.String,
-    "journey": pl.String,
-    "repetition": pl.Int64,
-    "detected_s": pl.Float64,
-    "way_m": pl.Float64,
-    "first": pl.List(pl.String),
-    "failure_s": pl.Float64,
-    "unsafe": pl.Int64,
-    "linking_errors": pl.Int64,
-    "seen_s": pl.List(pl.Float64),
-    "budget_s": pl.Float64,
-    "reaction_s": pl.Float64,
-}

@@ -45,10 +45,12 @@ class CatalogueFault:
 
     @property
     def name(self) -> str:
+        """Kind, size and unit: unique in the catalogue."""
         return self.kind if self.is_healthy else f"{self.kind} {self.size:g} {self.unit}".strip()
 
     @property
     def is_healthy(self) -> bool:
+        """A journey without a fault, to show what is no detection."""
         return self.kind.startswith(HEALTHY)
 
 

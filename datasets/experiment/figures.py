@@ -35,7 +35,7 @@ def drawn_figures(pmd: pl.DataFrame, detection: pl.DataFrame, geometry: pl.DataF
 
 
 def _points(frame: pl.DataFrame, *columns: str) -> list[tuple[float, float]]:
-    return list(frame.select(columns).iter_rows())
+    return list(frame.select(columns).drop_nulls().iter_rows())
 
 
 def pmd_plot(title: str, curves: Sequence[Curve]) -> str:

@@ -72,6 +72,7 @@ class ExperimentPlan:
 
     @property
     def basis_size(self) -> int:
+        """Rows of the basis: every signal at every weight, and the horizontal position."""
         return len(SIGNALS) * self.alphas.size + 2
 
 

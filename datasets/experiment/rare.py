@@ -121,15 +121,12 @@ def missed_table(runs: int, seed: int, jobs: int, config: Configuration | None) 
     asked = [(one, rate) for one in banks(config) for rate in _RATES_MPS]
     # At 10 Hz the faster ramps of GPS, since slow ones differ little from 1 Hz.
     asked += [(one, rate) for one in _fast(config) for rate in _RATES_MPS if rate >= _SLOWEST_AT_FAST_MPS]
-    return table(
-        [
-            _missed_row(constellation, bank, rate, epochs, reason) | found
-            for (constellation, bank), rate in asked
-            for reason, epochs, found in miss_figures(
-                bank, rate, failure_epoch(bank, rate), 1.0 / bank.spec.rate_hz, runs, seed, jobs
-            )
-        ]
-    )
+    rows: list[Row] = []
+    for (constellation, bank), rate in asked:
+        period_s = 1.0 / bank.spec.rate_hz
+        for reason, epochs, found in miss_figures(bank, rate, failure_epoch(bank, rate), period_s, runs, seed, jobs):
+            rows.append(_missed_row(constellation, bank, rate, epochs, reason) | found)
+    return table(rows)
 
 
 def _fast(config: Configuration | None) -> list[_Bank]:
@@ -201,9 +198,8 @@ def range_table(runs: int, seed: int, jobs: int, config: Configuration | None) -
             system = range_system(plan, 0.0)
             labels = {"constellation": constellation, "period_s": period_s}
             failure_s = min(plan.mean_failure_s(0.0, rate), float(_LONGEST_S))
-            for reason, epochs, found in miss_figures(
-                system, rate, int(failure_s / period_s), period_s, runs, seed, jobs
-            ):
+            at_failure = int(failure_s / period_s)
+            for reason, epochs, found in miss_figures(system, rate, at_failure, period_s, runs, seed, jobs):
                 time_s = epochs * period_s
                 at_most = max(miss_at_one_epoch(system, rate * time_s), SMALLEST)
                 asked = {"event": "missed_detection", "rate_mps": rate, "chosen_for": reason, "time_s": time_s}

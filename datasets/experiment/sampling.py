@@ -132,7 +132,10 @@ class Probability(NamedTuple):
 
 
 def false_alarm_probability(system: System, epochs: int, runs: int = 4000, seed: int = 1, jobs: int = 1) -> Probability:
-    """Probability that healthy monitors, long after their restart, fail at least once in this many epochs."""
+    """Probability that healthy monitors, long after their restart, fail at least once in this many epochs.
+
+    `runs`: sampled paths. Raises `ValueError` for a bank whose restart is not long ago.
+    """
     # Small enough for one thread of the linear algebra library, whose threads would cost more than they bring.
     size = max(1, min(system.runs_per_block, _LARGEST_BLOCK // (epochs * system.size)))
     alarms = partial(_alarms, system, epochs)
@@ -142,7 +145,7 @@ def false_alarm_probability(system: System, epochs: int, runs: int = 4000, seed:
 def missed_detection_probability(
     system: System, epochs: int, rate_mps: float, runs: int = 20_000, seed: int = 1, jobs: int = 1
 ) -> Probability:
-    """Probability that no monitor fails at epochs 1 .. n of a range ramp of `rate_mps`."""
+    """Probability that no monitor fails at epochs 1 .. n of a range ramp of `rate_mps`; `runs`: sampled paths."""
     miss = partial(miss_estimate, system, epochs, rate_mps, most_probable_miss(system, epochs, rate_mps))
     return pooled(np.array(in_pieces(miss, runs, population_of(runs), (seed, system.streams[1]), jobs)), runs)
 

@@ -1,13 +1,15 @@
 """The Monte Carlo against naive simulation, against theory, and against the paper's findings."""
 
 from dataclasses import replace
+from xml.etree import ElementTree
 
 import numpy as np
 import polars as pl
 import pytest
 
 from datasets.experiment import monte_carlo
-from datasets.experiment.diagnostics import detection_times, run_diagnostics, simulate
+from datasets.experiment.diagnostics import detection_times, geometry_table, run_diagnostics, simulate
+from datasets.experiment.figures import drawn_figures
 from datasets.experiment.geometry import CONSTELLATIONS, DEFAULT_NS, TAUS_S, default_geometry, geometry_at
 from datasets.experiment.monte_carlo import (
     NEVER,
@@ -20,6 +22,7 @@ from datasets.experiment.monte_carlo import (
 )
 from datasets.experiment.tables import time_columns
 from datasets.experiment.workers import generator
+from pipeline.show.svg_plot import even_ticks
 from pipeline.stages.monitors.pseudorange import range_variances_m2
 from tests.experiment.sigmas import bank_sigmas, limit_sigmas
 
@@ -277,3 +280,37 @@ def test_fault_free_runs_are_not_alarmed_more_often_than_the_bank_allows() -> No
     stricter = replace(plan, false_alarm_probability=1e-6)
     calm = first_passages(stricter, bank_forms(stricter), failure_forms(stricter), 1000, generator(9))
     assert calm.alarmed_before.mean() < 0.02 < result.alarmed_before.mean()
+
+
+def test_figures_of_hand_made_tables() -> None:
+    """Every figure stands for itself, and is drawn where the tables know nothing too."""
+    geometry = geometry_table(default_geometry("gps"))
+    plan = small_plan(rates_mps=(0.03, 0.1, 1.0), readings=("increments",))
+    few = first_passages(plan, bank_forms(plan), failure_forms(plan), 1, generator(3))
+    detection = detection_times(plan, few)
+    assert detection["time_to_detect_s"].null_count() == detection.height
+    pmd = pl.DataFrame(
+        {
+            "constellation": "gps",
+            "reading": "increments",
+            "sensors": "odometer",
+            "heading_deg": 0.0,
+            "rate_mps": 0.03,
+            "time_since_failure_s": [-10.0, 0.0, 10.0],
+            "pmd": [1.0, 0.5, 0.0],
+            "pmd_low": [0.9, 0.4, 0.0],
+            "pmd_high": [1.0, 0.6, 0.1],
+        }
+    )
+    drawn = drawn_figures(pmd, detection, geometry)
+    assert len(drawn) == 11
+    for drawing in drawn.values():
+        assert ElementTree.fromstring(drawing).tag.endswith("svg")
+    assert "GPS, 0.03 m/s" in drawn["figure_5_pmd_increments.svg"]
+    assert drawn["figure_4_sky_gps.svg"].count('r="4"') == geometry.height
+
+
+def test_ticks_are_round_numbers_within_the_axis() -> None:
+    assert even_ticks(-900.0, 100.0) == [-900.0 + 100.0 * number for number in range(11)]
+    assert even_ticks(0.0, 3.0) == [0.0, 0.5, 1.0, 1.5, 2.0, 2.5, 3.0]
+    assert even_ticks(0.3, 1.0) == pytest.approx([0.3 + 0.1 * number for number in range(8)])

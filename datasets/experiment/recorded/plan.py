@@ -82,6 +82,7 @@ class PlannedFault(Settings):
 
     @property
     def amounts(self) -> Amounts:
+        """All that the plan asks of it, in `unit`."""
         amounts: Amounts = getattr(self, _AMOUNTS[self.kind][0])
         return amounts
 
@@ -174,6 +175,7 @@ class Cell:
 
     @property
     def hits_satellite(self) -> bool:
+        """It hits the range of one satellite, drawn for each injection."""
         return self.fault.target == SATELLITE
 
     @property
@@ -182,9 +184,11 @@ class Cell:
 
     @property
     def target(self) -> str:
+        """As in a fault file, or `satellite`."""
         return SATELLITE if self.hits_satellite else self.spec(1.0, None).target
 
     def spec(self, start_s: float, satellite: str | None) -> FaultSpec:
+        """The fault as a fault file would hold it, from `start_s` after the first epoch on."""
         return self.fault.spec(self.amount, start_s, satellite)
 
 
