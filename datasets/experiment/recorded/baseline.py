@@ -132,8 +132,7 @@ class Baseline:
         ranges = self.monitored.prepared.ranges(self.solution)
         if ranges is None:
             return []
-        stamp = pl.lit(t_ns).cast(pl.Datetime("ns", "UTC"))
-        return ranges.filter((pl.col("t") == stamp) & pl.col("used"))["sv"].unique().sort().to_list()
+        return ranges.filter((pl.col("t") == instant(t_ns)) & pl.col("used"))["sv"].unique().sort().to_list()
 
     @cached_property
     def has_ranges(self) -> bool:
@@ -142,6 +141,11 @@ class Baseline:
         if ranges is None or ranges.is_empty():
             return False
         return float(np.isin(self.t_ns, times_ns(ranges)).mean()) >= _SHARE_WITH_RANGES
+
+
+def instant(t_ns: int) -> pl.Expr:
+    """A time stamp [ns since 1970, UTC] to compare with columns `t`."""
+    return pl.lit(t_ns).cast(pl.Datetime("ns", "UTC"))
 
 
 def _with_quiet(reason: Ints, t_ns: Ints, quiet_s: float) -> Ints:

@@ -10,7 +10,7 @@ from dataclasses import replace
 import numpy as np
 import polars as pl
 
-from datasets.experiment.recorded.baseline import Baseline, Onset
+from datasets.experiment.recorded.baseline import Baseline, Onset, instant
 from datasets.experiment.tables import Row
 from datasets.faults import FaultKind, FaultSpec
 from datasets.inject import inject
@@ -92,16 +92,12 @@ def _append_hit(recorded: pl.DataFrame, hit: pl.DataFrame | None, begin_ns: int)
     return before if hit is None else pl.concat([before, hit])
 
 
-def _instant(t_ns: int) -> pl.Expr:
-    return pl.lit(t_ns).cast(pl.Datetime("ns", "UTC"))
-
-
 def _before(frame: pl.DataFrame, begin_ns: int) -> pl.DataFrame:
-    return frame.filter(pl.col("t") < _instant(begin_ns))
+    return frame.filter(pl.col("t") < instant(begin_ns))
 
 
 def _between(frame: pl.DataFrame, begin_ns: int, end_ns: int) -> pl.DataFrame:
-    return frame.filter(pl.col("t").is_between(_instant(begin_ns), _instant(end_ns)))
+    return frame.filter(pl.col("t").is_between(instant(begin_ns), instant(end_ns)))
 
 
 def _cut(frame: pl.DataFrame | None, begin_ns: int, end_ns: int) -> pl.DataFrame | None:
@@ -249,9 +245,7 @@ def _tvb_lost_s(base: Baseline, watch: Watch, onset: Onset, end_ns: int) -> floa
 
 def _accepted(base: Baseline, onset: Onset, found: Injected) -> Row:
     """Balises accepted since the onset, and of them those whose position was wrong there, or may have been."""
-    accepted = found.monitored.solution.accepted.filter(
-        pl.col("t") >= pl.lit(onset.t_ns).cast(pl.Datetime("ns", "UTC"))
-    )
+    accepted = found.monitored.solution.accepted.filter(pl.col("t") >= instant(onset.t_ns))
     t_ns = times_ns(accepted)
     row = np.searchsorted(base.t_ns, t_ns).clip(max=base.t_ns.size - 1)
     train_m, sense = _train_at(base, t_ns, row)
@@ -291,8 +285,7 @@ def _where(base: Baseline, onset: Onset) -> Row:
     """The place and what the bank knew there, in the fault-free run."""
     epoch = base.epochs.row(int(np.searchsorted(base.t_ns, onset.t_ns)), named=True)
     fixes = base.monitored.solution.fixes
-    stamp = pl.lit(onset.t_ns).cast(pl.Datetime("ns", "UTC"))
-    satellites = fixes.filter(pl.col("t") == stamp)["satellites"].to_list()
+    satellites = fixes.filter(pl.col("t") == instant(onset.t_ns))["satellites"].to_list()
     kept = ("netelement_id", "measure_m", "path_m", "speed_mps", "curvature_per_m", "sigma_along_m")
     thresholds = {f"along_{scale}_threshold": epoch[f"along_{scale}_threshold"] for scale in SCALES}
     return {name: epoch[name] for name in kept} | {"satellites": satellites[0] if satellites else None} | thresholds

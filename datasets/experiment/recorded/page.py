@@ -16,17 +16,15 @@ from datasets.experiment.recorded.plan import RecordedPlan
 from datasets.faults import FaultKind
 from pipeline.show.report.columns import frame_table
 from pipeline.show.report.markup import page, script_json, section
-from pipeline.show.svg_plot import COLOURS, Axis, Curve, even_ticks, plot
+from pipeline.show.svg_plot import COLOURS, Axis, Curve, Piece, plot, strips
 from schemas.enums import OwnError
 from schemas.experiment import ExperimentBanks, ExperimentCells, ExperimentPlaces, ExperimentRuns
 from schemas.version import SOFTWARE
 
 _DETECT_S = (0.1, 1.0, 10.0, 100.0, 1000.0, 10000.0)
 _TARGETS = {"along": "along the track", "cross": "across the track", "satellite": "in one satellite's range"}
-_ALONG_THE_LINE = (
-    ("line", "unnoticed_max_m", "largest unnoticed error [m]"),
-    ("slowness", "slowness", "slowness of detection, T_D over the median of its cell"),
-)
+UNNOTICED_M = (2.0, 5.0, 10.0, 20.0)
+SLOWNESS = (0.8, 1.0, 1.25, 2.0)
 _CELL_COLUMNS = (
     *("bank", "cell", "injections", "passes", "noticed_share", "time_to_detect_median_s", "time_to_detect_p95_s"),
     *("failures", "pmd_at_failure", "stopped", "noticed_not_stopped", "accepted_wrong", "hazardous_max_s"),
@@ -55,9 +53,8 @@ def pictures(tables: dict[str, pl.DataFrame]) -> dict[str, tuple[str, str]]:
         title = f"T_D over the rate: ramps, {_TARGETS.get(str(target), target)}"
         drawn[f"time_to_detect_{target}"] = title, _time_to_detect(title, part)
     for (bank,), places in tables["places"].group_by("bank", maintain_order=True):
-        for name, column, what in _ALONG_THE_LINE:
-            title = f"The line: {what}, {bank}"
-            drawn[f"{name}_{bank}"] = title, _line(title, places, column, what)
+        title = f"The line: largest unnoticed error (upper lane) and slowness of detection (lower lane), {bank}"
+        drawn[f"line_{bank}"] = title, _line(title, places)
     return drawn
 
 
@@ -109,17 +106,18 @@ def _detection_curves(cells: pl.DataFrame) -> Iterator[Curve]:
         )
 
 
-def _line(title: str, places: pl.DataFrame, column: str, what: str) -> str:
-    """A line per net element through `column` in the middle of each of its pieces."""
-    known = places.drop_nulls(column).with_columns(middle_m=(pl.col("from_m") + pl.col("to_m")) / 2.0)
-    curves = [
-        Curve(str(element), list(part.select("middle_m", column).iter_rows()), COLOURS[number % len(COLOURS)])
-        for number, ((element,), part) in enumerate(known.group_by("netelement_id", maintain_order=True))
-    ]
-    longest_m = float(places["to_m"].max())  # type: ignore[arg-type]
-    most = max([1.0, *known[column].to_list()])
-    along = Axis("measure on the net element [m]", 0.0, longest_m, even_ticks(0.0, longest_m))
-    return plot(title, along, Axis(what, 0.0, most, even_ticks(0.0, most)), curves)
+def _line(title: str, places: pl.DataFrame) -> str:
+    """A strip of two lanes per net element."""
+    rows: dict[str, list[Piece]] = {}
+    for row in places.iter_rows(named=True):
+        slow = "not known" if row["slowness"] is None else f"{row['slowness']:.2f}"
+        words = (
+            f"{row['from_m']:.0f} to {row['to_m']:.0f} m: {row['injections']} faults, {row['noticed']} noticed; "
+            f"up to {row['unnoticed_max_m']:.1f} m unnoticed; slowness {slow}"
+        )
+        piece = Piece(row["from_m"], row["to_m"], (row["unnoticed_max_m"], row["slowness"]), words)
+        rows.setdefault(row["netelement_id"], []).append(piece)
+    return strips(title, rows, {"unnoticed [m]": UNNOTICED_M, "slowness": SLOWNESS})
 
 
 def recorded_page(tables: Mapping[str, pl.DataFrame], drawn: Mapping[str, tuple[str, str]], plan: RecordedPlan) -> str:
