@@ -16,7 +16,6 @@ from pipeline.stages.odometry.bound import is_lost
 from pipeline.stages.odometry.driven import turns_of
 from schemas.arrays import NS_PER_S, Bools, Floats, Ints, spans_of
 from schemas.config import Configuration, LdsConfig
-from schemas.conform import dtypes, table_of_rows
 from schemas.enums import BaliseKind, LinkingError, PassageStatus, Reaction
 from schemas.stages import AlignedEpochs, Crossings
 
@@ -327,21 +326,25 @@ def in_order_of_time(crossings: Sequence[Crossing]) -> list[Crossing]:
     return sorted(crossings, key=lambda crossing: (crossing.t_ns, crossing.epoch, crossing.balise.kind.value))
 
 
-def crossing_rows(crossings: Sequence[Crossing]) -> pl.DataFrame:
-    rows = [_row(number, crossing) for number, crossing in enumerate(crossings)]
-    return table_of_rows(rows, dtypes(Crossings))
+def arrays_of_crossings(crossings: Sequence[Crossing]) -> Crossings:
+    """What the LDS met, for later stages."""
+    balises = [crossing.balise for crossing in crossings]
+    return Crossings(
+        balise_id=[balise.balise_id for balise in balises],
+        netelement_id=[balise.netelement_id for balise in balises],
+        measure_m=np.array([balise.measure_m for balise in balises], dtype=np.float64),
+        leg=np.array([balise.leg for balise in balises], dtype=np.int64),
+        path_m=np.array([balise.path_m for balise in balises], dtype=np.float64),
+        virtual=np.array([balise.kind is BaliseKind.VIRTUAL for balise in balises], dtype=np.bool_),
+        before=np.array([crossing.before for crossing in crossings], dtype=np.int64),
+        epoch=np.array([crossing.epoch for crossing in crossings], dtype=np.int64),
+        t_ns=np.array([crossing.t_ns for crossing in crossings], dtype=np.int64),
+        offered=np.array([crossing.offered for crossing in crossings], dtype=np.bool_),
+        status=np.array([_STATUS.get(crossing.status, -1) for crossing in crossings], dtype=np.int64),
+    )
 
 
-def _row(number: int, crossing: Crossing) -> dict[str, object]:
-    offer = ("before", "epoch", "sense", "direction", "odometer_m", "offered")
-    return {
-        "crossing_id": number,
-        **{name: getattr(crossing, name) for name in offer},
-        **{name: getattr(crossing.balise, name) for name in ("leg", *PLACE)},
-        "kind": crossing.balise.kind.value,
-        "t": crossing.t_ns,
-        "status": crossing.status and crossing.status.value,
-    }
+_STATUS: dict[PassageStatus | None, int] = {status: number for number, status in enumerate(PassageStatus)}
 
 
 def reads_of(
