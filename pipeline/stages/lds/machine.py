@@ -239,9 +239,10 @@ class LocationSystem:
     def run(self) -> None:
         epoch = 0
         while epoch < len(self._t_ns):
-            end = self._uneventful_until(epoch)
-            if end > epoch:
+            if (end := self._uneventful_until(epoch)) > epoch:
                 self._pass_uneventful(epoch, end)
+            elif (end := self._hidden_until(epoch)) > epoch:
+                self._pass_hidden(epoch, end)
             else:
                 self._step(epoch)
             epoch = max(end, epoch + 1)
@@ -259,10 +260,17 @@ class LocationSystem:
             return epoch
         if self._journey.has_odometer and not self.distance.can_measure(epoch):
             return epoch
-        near = bisect_left(self._events, epoch)
-        end = self._events[near] if near < len(self._events) else len(self._t_ns)
+        end = self._next_event(epoch)
         for monitors in (self._bank, self.distance):
             end = monitors.quiet_until(epoch, end) if end > epoch else epoch
+        return self._first_closing(epoch, end)
+
+    def _next_event(self, epoch: int) -> int:
+        near = bisect_left(self._events, epoch)
+        return self._events[near] if near < len(self._events) else len(self._t_ns)
+
+    def _first_closing(self, epoch: int, end: int) -> int:
+        """The first epoch before `end` at which the window of a balise closes."""
         closing = self._way_m[epoch:end] > self.balises.closing_m
         return epoch + int(closing.argmax()) if closing.any() else end
 
@@ -271,6 +279,20 @@ class LocationSystem:
         self.evaluated[epoch:end] = evaluated.tolist()
         self.tvb[epoch:end] = (evaluated & self._journey.usable[epoch:end]).tolist()
         self._validated = True
+        self.balises.rearm(epoch, end)
+
+    def _hidden_until(self, epoch: int) -> int:
+        """The first epoch from here on for `_step`; before it the noise is unknown, and nothing was validated yet."""
+        if self._use is not Use.IN_USE or self._validated or self.distance.measures:
+            return epoch
+        end = self._next_event(epoch)
+        return self._first_closing(epoch, self._bank.hidden_until(epoch, end)) if end > epoch else epoch
+
+    def _pass_hidden(self, epoch: int, end: int) -> None:
+        self.withheld_for[epoch:end] = [LostTo.NOISE] * (end - epoch)
+        self._hidden_ns = self._t_ns[epoch] if self._hidden_ns is None else self._hidden_ns
+        if self._journey.slips[epoch:end].any():
+            self._consistent_since_ns = None
         self.balises.rearm(epoch, end)
 
     def _step(self, epoch: int) -> None:

@@ -385,6 +385,14 @@ class MonitorBank:
         first = int(ahead.argmax())
         return epoch + (first if ahead[first] else ahead.size)
 
+    def hidden_until(self, epoch: int, end: int) -> int:
+        """The first epoch from `epoch` on, at most `end`, at which the fast noise is known or something fails."""
+        self._look(epoch)
+        part = slice(epoch, min(self._known_to + 1, end))
+        shown = self._noise_known[part] | self._any[part]
+        first = int(shown.argmax())
+        return epoch + (first if shown[first] else shown.size)
+
     def along_evaluated_between(self, epoch: int, end: int) -> Bools:
         """Of epochs for which `quiet_until` answered."""
         return self._along[epoch:end]
