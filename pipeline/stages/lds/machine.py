@@ -5,13 +5,11 @@ from __future__ import annotations
 from bisect import bisect_left
 from collections.abc import Sequence
 from enum import Enum, auto
-from math import isnan
-
-import numpy as np
 
 from pipeline.stages.lds.crossings import (
     Balise,
     Crossing,
+    Disarmed,
     Journey,
     mission_epochs,
     odometer_epochs,
@@ -21,8 +19,8 @@ from pipeline.stages.lds.crossings import (
 from pipeline.stages.lds.link_monitors import Anchor, Held, LinkDistance, LinkOrder, Recovery, Relink, disorder
 from pipeline.stages.lds.linking import LinkingChain, LrvbChange
 from pipeline.stages.monitors.bank import MonitorBank
-from schemas.arrays import NS_PER_S, Floats
-from schemas.config import Configuration, LdsConfig
+from schemas.arrays import NS_PER_S
+from schemas.config import Configuration
 from schemas.enums import BaliseKind, LostTo, PassageStatus
 
 
@@ -132,46 +130,6 @@ class BaliseDetection:
         out_of_order = disorder(offered, overdue, self._journey, self._config)
         self.order.note(epoch, out_of_order)
         return out_of_order > 0
-
-
-class Disarmed:
-    """Balises just detected, re-armed max(`rearm_m`, `rearm_sigmas`) away (DOMAIN section 4).
-
-    By the odometer; without one by the position's distance from the balise.
-    """
-
-    def __init__(self, journey: Journey, config: LdsConfig) -> None:
-        self._journey = journey
-        self._config = config
-        self._at: dict[str, tuple[Balise, float]] = {}
-
-    def __bool__(self) -> bool:
-        return bool(self._at)
-
-    def holds(self, balise: Balise) -> bool:
-        return balise.balise_id in self._at
-
-    def add(self, crossing: Crossing) -> None:
-        odometer_m = float("nan") if crossing.odometer_m is None else crossing.odometer_m
-        self._at[crossing.balise.balise_id] = (crossing.balise, odometer_m)
-
-    def rearm(self, begin: int, end: int) -> None:
-        """Those that are far enough away at one of the epochs from `begin` on, before `end`."""
-        part = slice(begin, end)
-        away_m = np.fmax(self._config.rearm_m, self._config.rearm_sigmas * self._journey.sigma_m[part])
-        for name, (balise, at_m) in list(self._at.items()):
-            if (np.abs(self._moved_m(part, balise, at_m)) >= away_m).any():
-                del self._at[name]
-
-    def _moved_m(self, part: slice, balise: Balise, at_m: float) -> Floats:
-        if not self._journey.has_odometer:
-            return self._journey.path_m[part] - balise.path_m
-        odometer_m = self._journey.odometer_m[part]
-        if isnan(at_m):
-            known = odometer_m[np.isfinite(odometer_m)]
-            at_m = float(known[0]) if known.size else at_m
-            self._at[balise.balise_id] = (balise, at_m)
-        return odometer_m - at_m
 
 
 class Use(Enum):
