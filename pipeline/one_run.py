@@ -19,7 +19,7 @@ from pipeline.studies.plausibility.fit import Fit, clock_advice, required_fit, w
 from pipeline.studies.plausibility.report import accuracy_checks, refuted
 from pipeline.studies.undetected.columns import Undetected, unnoticed_of
 from schemas.config import Configuration, Vehicle
-from schemas.conform import conform
+from schemas.conform import shaped
 from schemas.enums import Reason
 from schemas.errors import InputError
 from schemas.run import RunLog, RunTables, Site
@@ -52,8 +52,7 @@ def replay(run: RunLog, site: Site, vehicle: Vehicle | None = None, config: Conf
             parts.append(_failed(prepared, solution, error))
     if len(errors) == len(parts):
         raise errors[0]
-    # Each part was brought to the contract when it was made.
-    whole = {name: pl.concat([part[name] for part in parts]) for name in TABLES}
+    whole = {name: pl.concat([part[name] for part in parts]) if len(parts) > 1 else parts[0][name] for name in TABLES}
     return RunTables(run_id=run.run_id, **whole)
 
 
@@ -103,11 +102,11 @@ def _of_solution(prepared: PreparedRun, solution: str, channel_match: Matches, e
         "hazards": judged.hazards,
         "passages": judged.passages,
         "alarms": judged.alarms,
-        "epochs": pl.DataFrame([*judged.epochs.series(), *columns]),
+        "epochs": pl.DataFrame([*judged.epochs.contract_series(), *columns]),
         "runs": summarise(results, prepared.config, prepared.provenance),
     }
     # Judged epochs have more columns than the contract: those end here.
-    return {name: conform(table, TABLES[name]) for name, table in tables.items()}
+    return {name: shaped(table, TABLES[name]) for name, table in tables.items()}
 
 
 def _case(
@@ -186,4 +185,4 @@ def _track_assumed(judged: Judged) -> bool:
 def _failed(prepared: PreparedRun, solution: str, error: InputError) -> Tables:
     """A solution without content but for the row that says why."""
     nothing = {name: table.create_empty() for name, table in TABLES.items()}
-    return nothing | {"runs": conform(failed_row(str(error), prepared.provenance, solution), TABLES["runs"])}
+    return nothing | {"runs": shaped(failed_row(str(error), prepared.provenance, solution), TABLES["runs"])}

@@ -14,10 +14,14 @@ from pipeline.stages.epochs.monitored import MonitoredEpochs
 from pipeline.stages.evidence import TruePlaces
 from pipeline.stages.evidence.evidence import KINDS
 from schemas.arrays import Bools, Floats, Ints, Rows
+from schemas.conform import dtypes
 from schemas.enums import Evidence, Judgement
 from schemas.frozen import frozen
-from schemas.stages import Crossings, arrays_of, gathered, words_of
+from schemas.stages import Crossings, arrays_of, gathered, series_of, words_of
+from schemas.tables import Epochs
 
+# Columns of the table whose arrays have another name.
+_ARRAYS = {"t": "t_ns", "netelement_id": "element", "lrvb_id": "lrvb"}
 JUDGEMENTS = tuple(Judgement)
 RIGHT, WRONG, UNKNOWN = (JUDGEMENTS.index(word) for word in (Judgement.RIGHT, Judgement.WRONG, Judgement.UNKNOWN))
 REFERENCE, BALISE, ODOMETER = (KINDS.index(kind) for kind in (Evidence.REFERENCE, Evidence.BALISE, Evidence.ODOMETER))
@@ -158,10 +162,22 @@ class JudgedEpochs(MonitoredEpochs):
         return self.tvb & (self.moves | ~self.may_move)
 
     def series(self) -> list[pl.Series]:
-        """All columns, those of the `epochs` table among them."""
+        """All columns, for studies that read tables."""
+        return [*super().series(), *self._of_evidence()]
+
+    def contract_series(self) -> list[pl.Series]:
+        """The columns of the `epochs` table that the judge knows."""
+        of_table = {_ARRAYS.get(name, name) for name in dtypes(Epochs)}
+        return [
+            *(series_of(self, name) for name in arrays_of(type(self)) if name in of_table),
+            self.solution_series(),
+            *(column for name, one in self.verdicts.items() for column in one.columns(name)),
+            *self._of_evidence(),
+        ]
+
+    def _of_evidence(self) -> list[pl.Series]:
         moving = np.where(self.may_move & ~self.moves, np.nan, self.moves)
         return [
-            *super().series(),
             *self.judgements.columns(),
             *self.true_places.columns(),
             pl.Series("moving", moving, nan_to_null=True).cast(pl.Boolean),

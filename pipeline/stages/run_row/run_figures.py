@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Mapping, Sequence
+from functools import cache
 from typing import Any
 
 import numpy as np
@@ -248,11 +249,20 @@ def _wrong() -> pl.Expr:
 def balise_counts(passages: pl.DataFrame) -> Row:
     """What became of the virtual balises, and of those accepted what the judge says of their positions."""
     virtual = passages.filter(pl.col("kind") == enums.BaliseKind.VIRTUAL)
-    counts = {"balises_on_path": is_passage(), **{f"balises_{name}": met for name, met in outcomes().items()}}
-    errors = spread(pl.col("location_error_m").filter(accepted()), "location_error", "count")
+    return virtual.select(**_of_balises()).row(0, named=True)
+
+
+@cache
+def _of_balises() -> dict[str, pl.Expr]:
+    """Columns of `runs` over the passages of virtual balises."""
+    counts = {"balises_on_path": is_passage()}
+    counts |= {f"balises_{name}": becomes for name, becomes in outcomes().items()} | acceptances()
     each_once = {"balises_passed": is_passage(), "balises_found": is_passage() & accepted()}
-    once = {name: virtual.filter(condition)["balise_id"].n_unique() for name, condition in each_once.items()}
-    return _count_rows(virtual, counts | acceptances()) | virtual.select(**errors).row(0, named=True) | once
+    return {
+        **{name: condition.sum() for name, condition in counts.items()},
+        **spread(pl.col("location_error_m").filter(accepted()), "location_error", "count"),
+        **{name: pl.col("balise_id").filter(condition).n_unique() for name, condition in each_once.items()},
+    }
 
 
 def _count_rows(frame: pl.DataFrame, conditions: Mapping[str, pl.Expr]) -> Row:
