@@ -326,6 +326,12 @@ class Crossings:
     """Row of the first epoch at or after the crossing."""
     t_ns: Ints
     """The crossing, interpolated; of a telegram its own time; after a gap that of `epoch` [ns since 1970, UTC]."""
+    sense: Ints
+    """+1 passed along growing path, -1 against it."""
+    direction: Ints
+    """Direction of travel at the crossing, +1 or -1 along growing path."""
+    odometer_m: Floats
+    """Odometer distance at the crossing [m]."""
     offered: Bools
     """Offered to the train; false: inside a gap, or crossed again before the balise was re-armed."""
     status: Ints

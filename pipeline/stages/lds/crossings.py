@@ -379,6 +379,9 @@ def arrays_of_crossings(crossings: Sequence[Crossing]) -> Crossings:
         before=np.array([crossing.before for crossing in crossings], dtype=np.int64),
         epoch=np.array([crossing.epoch for crossing in crossings], dtype=np.int64),
         t_ns=np.array([crossing.t_ns for crossing in crossings], dtype=np.int64),
+        sense=np.array([crossing.sense for crossing in crossings], dtype=np.int64),
+        direction=np.array([crossing.direction for crossing in crossings], dtype=np.int64),
+        odometer_m=np.array([crossing.odometer_m for crossing in crossings], dtype=np.float64),
         offered=np.array([crossing.offered for crossing in crossings], dtype=np.bool_),
         status=np.array([_STATUS.get(crossing.status, -1) for crossing in crossings], dtype=np.int64),
     )

@@ -296,8 +296,8 @@ def test_a_jump_back_leads_to_a_place_that_is_not_wrong(
     low_m = np.where(np.arange(2) == 0, middle_m, size_m)
     kind, track = np.zeros(2, dtype=np.int64), np.zeros(2, dtype=bool)
     judged = Judgements(np.array([WRONG, code]), low_m, low_m, kind, track, np.zeros(2, dtype=bool))
-    judged_course = replace(history(positions(range(2))), judged=judged)
-    assert bool(_is_back(judged_course, Jump(1, 1, step_m))) is back
+    of_judged = history(replace(positions(range(2)), judgements=judged))
+    assert bool(_is_back(of_judged, Jump(1, 1, step_m))) is back
 
 
 @pytest.mark.parametrize(("may_s", "detected_s"), [(104.5, 107.0), (None, 107.0), (104.5, None)])
@@ -850,6 +850,7 @@ def test_what_was_offered_and_of_it_what_the_lds_accepted() -> None:
     crossings = Crossings(
         balise_id=names, netelement_id=["n"] * len(rows), measure_m=at * 1.0, leg=at, path_m=at * 1.0,
         virtual=np.array(virtual), before=at, epoch=at, t_ns=at, offered=np.array(offered),
+        sense=np.ones_like(at), direction=np.ones_like(at), odometer_m=at * 1.0,
         status=np.array([-1 if one is None else list(PassageStatus).index(one) for one in status]),
     )  # fmt: skip
     absent: Any = None

@@ -194,7 +194,7 @@ def _crossings(met: Crossings) -> pl.DataFrame:
             "kind": np.where(met.virtual, "virtual", "physical"),
             "status": pl.Series([words[number] for number in met.status], dtype=pl.String),
             **{name: getattr(met, name) for name in ("balise_id", "netelement_id", "measure_m", "leg", "path_m")},
-            **{name: getattr(met, name) for name in ("before", "epoch", "offered")},
+            **{name: getattr(met, name) for name in ("before", "epoch", "sense", "direction", "odometer_m", "offered")},
         }
     )
 

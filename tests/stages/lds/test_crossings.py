@@ -50,6 +50,7 @@ def test_a_crossing_lies_between_its_epochs(seed: int) -> None:
         ends_m = chaos.path_m[row["before"]], chaos.path_m[row["epoch"]]
         assert ends_m[0] is not None
         assert ends_m[1] is not None
+        assert (row["sense"] > 0) == (ends_m[1] > ends_m[0])
         assert min(ends_m) <= row["path_m"] <= max(ends_m)
 
 
