@@ -94,7 +94,7 @@ JUDGEMENTS = tuple(Judgement)
 _JUDGEMENT_WORDS = pl.Series("judgement", [word.value for word in Judgement], dtype=pl.Enum(Judgement))
 _EVIDENCE_WORDS = pl.Series("evidence", [*(kind.value for kind in KINDS), None], dtype=pl.Enum(Evidence))
 RIGHT, WRONG, UNKNOWN = (JUDGEMENTS.index(word) for word in (Judgement.RIGHT, Judgement.WRONG, Judgement.UNKNOWN))
-REFERENCE, BALISE, ODOMETER = (KINDS.index(kind) for kind in (Evidence.REFERENCE, Evidence.BALISE, Evidence.ODOMETER))
+REFERENCE, ODOMETER = (KINDS.index(kind) for kind in (Evidence.REFERENCE, Evidence.ODOMETER))
 
 
 @frozen
@@ -174,8 +174,8 @@ class Judgements:
 
     @cached_property
     def by_truth(self) -> Bools:
-        """By reference or balise reads, which alone can call a position right."""
-        return np.isin(self.kind, [REFERENCE, BALISE])
+        """By evidence that can call a position right: any but the odometer since an accepted VB."""
+        return np.greater_equal(self.kind, 0) & np.not_equal(self.kind, ODOMETER)
 
     @cached_property
     def middle_m(self) -> Floats:

@@ -274,7 +274,7 @@ def _decisive(epochs: EpochFigures, passages: pl.DataFrame, failures: pl.DataFra
 
 
 def _verdict(row: Row, config: Configuration) -> Row:
-    reasons = reasons_of(row, config.budget_s, config.hazards.undiagnosed_share)
+    reasons = reasons_of(row, config.budget_s, config.hazards)
     return {"verdict": verdict_of(reasons), "reasons": reasons}
 
 
