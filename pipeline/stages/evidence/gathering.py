@@ -5,9 +5,11 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import replace
 from itertools import pairwise
+from typing import NamedTuple
 
 import numpy as np
 import polars as pl
+import pyarrow as pa
 
 from pipeline.stages.evidence.anchors import (
     KnownStretch,
@@ -48,6 +50,7 @@ from pipeline.stages.track.survey import SurveyedTrack
 from schemas.arrays import NS_PER_S, Floats, Ints, floats, times_ns
 from schemas.config import Configuration, HazardConfig, Vehicle
 from schemas.enums import Origin
+from schemas.frozen import frozen
 
 
 def on_time(stream: pl.DataFrame | None, latency_s: float) -> pl.DataFrame | None:
@@ -340,31 +343,64 @@ def _parted(odometers: Sequence[Odometry], config: Configuration) -> bool:
     return False
 
 
-def true_places(evidence: EvidenceSet, track: SurveyedTrack) -> pl.DataFrame:
-    """Per instant `true_netelement_ids`, in the order of the survey, `true_measure_low_m` and `true_measure_high_m`.
+@frozen
+class TruePlaces:
+    """Where the train was at each instant by the evidence; shape (instants,)."""
 
-    Null where nothing is known; the measures also where there are several net elements.
-    """
+    netelement_ids: pl.Series
+    """Every net element that the evidence leaves, in the order of the survey; null where nothing is known."""
+    low_m: Floats
+    """Least measure where one net element is left [m]."""
+    high_m: Floats
+    """Largest measure there [m]."""
+
+    def at(self, rows: Ints) -> TruePlaces:
+        """Those of some instants."""
+        return TruePlaces(self.netelement_ids[rows], self.low_m[rows], self.high_m[rows])
+
+    def columns(self) -> list[pl.Series]:
+        """As they stand in `epochs`."""
+        return [
+            self.netelement_ids.alias("true_netelement_ids"),
+            pl.Series("true_measure_low_m", self.low_m, nan_to_null=True),
+            pl.Series("true_measure_high_m", self.high_m, nan_to_null=True),
+        ]
+
+
+def true_places(evidence: EvidenceSet, track: SurveyedTrack) -> TruePlaces:
+    """Every net element that one of the alternatives touches, with the measures on it."""
     parts = [_touched(alternative) for alternative in evidence.alternatives]
-    touched = pl.concat([pl.DataFrame(schema=_TOUCHED), *parts])
-    elements = pl.col("element").unique().sort()
-    places = touched.group_by("row").agg(elements, low=pl.col("low").min(), high=pl.col("high").max())
-    alone = pl.col("element").list.len() == 1
-    names = pl.Series(track.ids, dtype=pl.String)
-    numbers = pl.Series(range(names.len()), dtype=pl.Int64)
-    rows = pl.DataFrame({"row": np.arange(evidence.kind.size)})
-    return rows.join(places, on="row", how="left", maintain_order="left").select(
-        true_netelement_ids=pl.col("element").list.eval(pl.element().replace_strict(numbers, names)),
-        true_measure_low_m=pl.when(alone).then("low"),
-        true_measure_high_m=pl.when(alone).then("high"),
-    )
+    row, element = (np.concatenate([np.zeros(0, np.int64), *(getattr(part, name) for part in parts)]) for name in _KEYS)
+    ends_m = [np.concatenate([np.zeros(0), *(getattr(part, name) for part in parts)]) for name in ("low_m", "high_m")]
+    order = np.lexsort((element, row))
+    row, element, low_m, high_m = (values[order] for values in (row, element, *ends_m))
+    size = evidence.kind.size
+    begins = np.flatnonzero(np.diff(row, prepend=-1))
+    # Each net element once an instant, however often the train's routes lead over it.
+    once = np.diff(row * len(track.ids) + element, prepend=-1) != 0
+    counts = np.bincount(row[once], minlength=size)
+    places_m = np.full((2, size), np.nan)
+    if begins.size:
+        places_m[:, row[begins]] = np.minimum.reduceat(low_m, begins), np.maximum.reduceat(high_m, begins)
+    names = pl.Series(track.ids, dtype=pl.String)[element[once]]
+    offsets = np.concatenate([[0], np.cumsum(counts)]).astype(np.int32)
+    lists = pa.ListArray.from_arrays(pa.array(offsets), names.to_arrow(), mask=pa.array(counts == 0))
+    return TruePlaces(pl.Series(lists, dtype=pl.List(pl.String)), *np.where(counts == 1, places_m, np.nan))
 
 
-_TOUCHED = {"row": pl.Int64, "element": pl.Int64, "low": pl.Float64, "high": pl.Float64}
+_KEYS = ("row", "element")
 
 
-def _touched(there: Alternative) -> pl.DataFrame:
-    """Every net element that the interval touches, with the measures on it: one row per instant and visit."""
+class _Touched(NamedTuple):
+    """Net elements that an interval touches: one each instant and visit."""
+
+    row: Ints
+    element: Ints
+    low_m: Floats
+    high_m: Floats
+
+
+def _touched(there: Alternative) -> _Touched:
     route = there.route
     first, last = (
         np.maximum(np.searchsorted(route.entry_m, at_m, side="right") - 1, 0) for at_m in (there.low_m, there.high_m)
@@ -378,10 +414,9 @@ def _touched(there: Alternative) -> pl.DataFrame:
         np.clip(at_m[numbers] - route.entry_m[visit], 0.0, high - low) for at_m in (there.low_m, there.high_m)
     )
     forward = route.forward[visit]
-    columns = {
-        "row": there.rows[numbers],
-        "element": route.element[visit],
-        "low": np.where(forward, low + begin, high - end),
-        "high": np.where(forward, low + end, high - begin),
-    }
-    return pl.DataFrame(columns, schema=_TOUCHED)
+    return _Touched(
+        row=there.rows[numbers],
+        element=route.element[visit],
+        low_m=np.where(forward, low + begin, high - end),
+        high_m=np.where(forward, low + end, high - begin),
+    )
