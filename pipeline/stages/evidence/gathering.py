@@ -17,7 +17,6 @@ from pipeline.stages.evidence.anchors import (
     final_stands,
     on_clock,
     outside,
-    read_anchors,
     reference_ways,
     shown_on_its_track,
     sided,
@@ -204,8 +203,7 @@ _PARTED_S = 60.0
 
 def evidence_of(
     reference: tuple[Sequence[ReferenceStretch], Sequence[Span]],
-    reads: pl.DataFrame | None,
-    balises: pl.DataFrame | None,
+    recorders: Sequence[Sequence[TrueAnchor]],
     odometers: Sequence[Odometry],
     network: Network,
     vehicle: Vehicle,
@@ -213,8 +211,9 @@ def evidence_of(
 ) -> TrainEvidence:
     """Everything that is known of where the train was, except from GNSS.
 
-    `reference`: as from `reference_stretches`; `odometers`: that of the LDS first. Where any is independent, the others
-    confirm nothing and narrow nothing; where none is, what they carry proves nothing.
+    `reference`: as from `reference_stretches`; `recorders`: anchors of each other one, by its clock, in order of time;
+    `odometers`: that of the LDS first. Where any is independent, the others confirm nothing and narrow nothing; where
+    none is, what they carry proves nothing.
     """
     hazards = config.hazards
     independent = [odometer for odometer in odometers if odometer.independent]
@@ -230,10 +229,12 @@ def evidence_of(
     lags = [_lags_of_reference(stretches, search, least_m) for search in searches]
     # Any odometer contradicts a reference; where one is independent, the others are not asked.
     found = [Witness.of(*of_one, config) for of_one in zip(counters, lags, strict=True)]
-    read = read_anchors(reads, balises, network.track, hazards)
-    lags_of_reads = [_lags_of_reads(search.carried(_points(read)), config) for search in searches]
-    of_reference, of_reads = clocks_of((lags, lags_of_reads), bool(independent), hazards)
-    clocked = on_clock(read, of_reads, main)
+    lags_of_others = [
+        [_lags_of_anchors(search.carried(_points(anchors)), config) for search in searches] for anchors in recorders
+    ]
+    of_reference, *of_others = clocks_of((lags, *lags_of_others), bool(independent), hazards)
+    by_recorder = [on_clock(anchors, clock, main) for anchors, clock in zip(recorders, of_others, strict=True)]
+    clocked = sorted((anchor for anchors in by_recorder for anchor in anchors), key=lambda anchor: anchor.t_ns)
     recorded, unclosed = _known_stretches(sides, of_reference, found, clocked, searches, vehicle, config)
     known = tuple(part for stretch in recorded for part in stretch.trusted())
     unsure = [span for stretch in recorded for span in stretch.doubtful_spans()]
@@ -245,19 +246,24 @@ def evidence_of(
         carried=tuple(search.carried(_borders(known, search.counter, apart)) for search in searches),
         by_reads=tuple(search.carried(_points(clocked)) for search in searches) if recorded else (),
         reads_ns=np.array([anchor.t_ns for anchor in clocked], dtype=np.int64),
-        clocks=(of_reference,) * bool(known) + (of_reads,) * bool(apart),
+        clocks=(of_reference,) * bool(known) + _used(of_others, [outside(anchors, known) for anchors in by_recorder]),
         network=network,
         config=config,
         stands=final_stands([stretch.reference for stretch in known], independent, config),
         parted=_parted(odometers, config),
         unsure=tuple(unsure),
-        true_clocks_s=true_clocks_s((of_reference,) * bool(known) + (of_reads,) * bool(clocked)),
+        true_clocks_s=true_clocks_s((of_reference,) * bool(known) + _used(of_others, by_recorder)),
         disputes=tuple(span for stretch in recorded for span in stretch.disputed),
         doubted=unclosed
         + sum(stretch.levels.doubts for stretch in recorded)
         + (0 if counters else sum(len(stretch.disputed) for stretch in recorded))
         + sum(len(of_one.found) > 1 for of_one in lags),
     )
+
+
+def _used(clocks: Sequence[RecorderClock], anchors: Sequence[Sequence[TrueAnchor]]) -> tuple[RecorderClock, ...]:
+    """The clocks of the recorders that have anchors."""
+    return tuple(clock for clock, of_one in zip(clocks, anchors, strict=True) if of_one)
 
 
 def _known_stretches(
@@ -309,8 +315,8 @@ def _lags_of_reference(stretches: Sequence[ReferenceStretch], search: GapSearch,
     return lags_of(begin_ns, end_ns, way_m, sigma_m, search.counter, search.config)
 
 
-def _lags_of_reads(source: Carried, config: Configuration) -> Lags:
-    """The clock of the reads against an odometer's, by the ways between reads, whether they close or not."""
+def _lags_of_anchors(source: Carried, config: Configuration) -> Lags:
+    """The clock of a recorder against an odometer's, by the ways between its anchors, whether they close or not."""
     ways = [
         (gap.begin_ns, gap.end_ns, apart_m, float(np.linalg.norm([anchor.sigma_m for anchor in gap.anchors])))
         for gap in source.gaps

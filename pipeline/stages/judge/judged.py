@@ -24,7 +24,7 @@ from schemas.tables import Epochs
 _ARRAYS = {"t": "t_ns", "netelement_id": "element", "lrvb_id": "lrvb"}
 JUDGEMENTS = tuple(Judgement)
 RIGHT, WRONG, UNKNOWN = (JUDGEMENTS.index(word) for word in (Judgement.RIGHT, Judgement.WRONG, Judgement.UNKNOWN))
-REFERENCE, BALISE, ODOMETER = (KINDS.index(kind) for kind in (Evidence.REFERENCE, Evidence.BALISE, Evidence.ODOMETER))
+REFERENCE, ODOMETER = (KINDS.index(kind) for kind in (Evidence.REFERENCE, Evidence.ODOMETER))
 _JUDGEMENT_WORDS = words_of(Judgement)
 _EVIDENCE_WORDS = words_of(Evidence)
 
@@ -85,8 +85,8 @@ class Judgements:
 
     @cached_property
     def by_truth(self) -> Bools:
-        """By reference or balise reads, which alone can call a position right."""
-        return np.asarray((self.kind == REFERENCE) | (self.kind == BALISE))
+        """By evidence that can call a position right: any but the odometer since an accepted VB."""
+        return np.asarray((self.kind >= 0) & (self.kind != ODOMETER))
 
     @cached_property
     def middle_m(self) -> Floats:

@@ -24,7 +24,7 @@ from pipeline.stages.run_row.bounds import (
 )
 from schemas import enums
 from schemas.arrays import NS_PER_S, Bools, Floats, Ints, median
-from schemas.config import Configuration
+from schemas.config import Configuration, HazardConfig
 from schemas.enums import TRUTH, Judgement, PassageStatus, Reason, RunVerdict, ThrVerdict
 from schemas.tables import SCALES
 
@@ -64,10 +64,10 @@ LEVEL_LISTS = {
 _OF_LEVEL = {RunVerdict.UNSAFE: ThrVerdict.EXCEEDED, RunVerdict.UNPROVEN: ThrVerdict.UNKNOWN}
 
 
-def reasons_of(run: RunRow, allowed_s: float, undiagnosed_share: float) -> list[Reason]:
+def reasons_of(run: RunRow, allowed_s: float, hazards: HazardConfig) -> list[Reason]:
     """Why a run has its verdict, by the columns `DECISIVE` of its row (DOMAIN section 5.4).
 
-    `allowed_s`: allowed T_D; `undiagnosed_share`: of the configuration.
+    `allowed_s`: allowed T_D; `hazards`: its limits.
     """
     failures = failures_in(run)
     within, beyond = level_counts(failures, allowed_s)
@@ -80,7 +80,7 @@ def reasons_of(run: RunRow, allowed_s: float, undiagnosed_share: float) -> list[
         Reason.ACCEPTED_UNKNOWN: run["unproven_accepted"] > 0,
         Reason.BUDGET_UNKNOWN: within + beyond < len(failures),
         Reason.UNKNOWN_IN_USE: (run["unknown_in_use_s"] or 0.0) > allowed_s,
-        Reason.NOT_DIAGNOSED: (run["share_undiagnosed"] or 0.0) > undiagnosed_share,
+        Reason.NOT_DIAGNOSED: (run["share_undiagnosed"] or 0.0) > hazards.undiagnosed_share,
         Reason.NOTHING_ACCEPTED: run["balises_accepted"] == 0,
         **{reason: reason in (run["reasons"] or ()) for reason in _LASTING},
     }
@@ -106,7 +106,7 @@ def level_rows(run: RunRow, config: Configuration) -> list[dict[str, object]]:
     for level in config.safety.service_levels:
         allowed_s = config.safety.allowed_time_to_detect_s(level)
         within, exceeded = level_counts(failures, allowed_s)
-        verdict = verdict_of(reasons_of(run, allowed_s, config.hazards.undiagnosed_share))
+        verdict = verdict_of(reasons_of(run, allowed_s, config.hazards))
         values = (level, allowed_s, within, exceeded, _OF_LEVEL.get(verdict, in_time).value)
         rows.append(dict(zip(LEVEL_LISTS, values, strict=True)))
     return rows

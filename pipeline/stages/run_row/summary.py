@@ -277,7 +277,7 @@ def _decisive(epochs: JudgedEpochs, passages: pl.DataFrame, failures: Sequence[F
 
 
 def _verdict(row: Row, config: Configuration) -> Row:
-    reasons = reasons_of(row, config.budget_s, config.hazards.undiagnosed_share)
+    reasons = reasons_of(row, config.budget_s, config.hazards)
     return {"verdict": verdict_of(reasons), "reasons": reasons}
 
 
