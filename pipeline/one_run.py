@@ -29,6 +29,8 @@ Tables = dict[str, pl.DataFrame]
 """Those of one solution, by name."""
 Matches = dict[str, Match]
 """By solution: the one that is replayed, and the one, if any, that the channel monitor compares with it."""
+Channel = dict[str, tuple[Fit, Match]]
+"""The solution that the channel monitor compares with; empty without one."""
 
 
 def replay(run: RunLog, site: Site, vehicle: Vehicle | None = None, config: Configuration | None = None) -> RunTables:
@@ -39,13 +41,13 @@ def replay(run: RunLog, site: Site, vehicle: Vehicle | None = None, config: Conf
     """
     prepared = prepare(run, site, vehicle or Vehicle(), config or Configuration(), clock_advice)
     evidence = prepared.evidence()
-    channel_match = _compared_with(prepared)
+    channel = _compared_with(prepared)
     errors: list[InputError] = []
     parts: list[Tables] = []
     # A solution at a time: of those done only the tables are kept.
     for solution in prepared.run.solutions():
         try:
-            parts.append(_of_solution(prepared, solution, channel_match, evidence))
+            parts.append(_of_solution(prepared, solution, channel, evidence))
         except InputError as error:
             # A receiver that never had a fix must not take the run's other solutions with it.
             errors.append(error)
@@ -61,13 +63,12 @@ def monitor_alone(run: RunLog, site: Site, vehicle: Vehicle, config: Configurati
     if solution not in run.solutions():
         raise InputError("has no such solution", place=run.run_id, found=solution, expected=", ".join(run.solutions()))
     prepared = prepare(run, site, vehicle, config, clock_advice)
-    required_fit(prepared, solution, vehicle)
-    matches = _with_match(_compared_with(prepared), prepared, solution)
+    _, matches = _fitted(prepared, solution, _compared_with(prepared))
     return monitor_solution(prepared, solution, matches, prepared.evidence())
 
 
-def _compared_with(prepared: PreparedRun) -> Matches:
-    """The match of the solution that the channel monitor compares with, the only one that is kept over all solutions.
+def _compared_with(prepared: PreparedRun) -> Channel:
+    """The solution that the channel monitor compares with, the only one whose match is kept over all solutions.
 
     Empty where that solution does not fit the run or lies on no track: then it has a failed row of its own.
     """
@@ -75,23 +76,25 @@ def _compared_with(prepared: PreparedRun) -> Matches:
     if channel not in prepared.run.solutions():
         return {}
     try:
-        required_fit(prepared, channel, prepared.vehicle)
-        return {channel: prepared.match(channel)}
+        return {channel: (required_fit(prepared, channel, prepared.vehicle), prepared.match(channel))}
     except InputError:
         return {}
 
 
-def _with_match(channel_match: Matches, prepared: PreparedRun, solution: str) -> Matches:
-    return channel_match if solution in channel_match else {**channel_match, solution: prepared.match(solution)}
+def _fitted(prepared: PreparedRun, solution: str, channel: Channel) -> tuple[Fit, Matches]:
+    """How the solution fits the run, and its match beside that of the channel; raises `InputError` as both do."""
+    known = channel.get(solution)
+    fit, match = known or (required_fit(prepared, solution, prepared.vehicle), prepared.match(solution))
+    return fit, {**{name: other for name, (_, other) in channel.items()}, solution: match}
 
 
-def _of_solution(prepared: PreparedRun, solution: str, channel_match: Matches, evidence: TrainEvidence) -> Tables:
+def _of_solution(prepared: PreparedRun, solution: str, channel: Channel, evidence: TrainEvidence) -> Tables:
     """What the train made of one solution, what nobody would have noticed, and what the judge says of it.
 
     Raises `InputError` where the solution does not fit the run or lies on no track.
     """
-    fit = required_fit(prepared, solution, prepared.vehicle)
-    monitored = monitor_solution(prepared, solution, _with_match(channel_match, prepared, solution), evidence)
+    fit, matches = _fitted(prepared, solution, channel)
+    monitored = monitor_solution(prepared, solution, matches, evidence)
     unnoticed = unnoticed_of(monitored)
     judged = judge(_case(monitored, unnoticed, evidence, fit.leaps_s(evidence.in_step)))
     results = _results(monitored, judged, unnoticed, fit, evidence)

@@ -19,7 +19,6 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 import polars as pl
-from scipy.signal import lfilter
 
 from pipeline.stages.monitors.bank import MonitorBank
 from schemas.config import Configuration
@@ -67,6 +66,8 @@ def _stamps(receiver: Receiver, hours: float, rng: np.random.Generator) -> Float
 
 def _gauss_markov(t_s: Floats, tau_s: float, rng: np.random.Generator) -> Floats:
     """Unit variance; on the regular grid of the rate, then read at the stamps."""
+    from scipy.signal import lfilter  # takes long to load
+
     step_s = float(np.min(np.diff(t_s)))
     grid = np.round(t_s / step_s).astype(np.int64)
     phi = np.exp(-step_s / tau_s)

@@ -125,7 +125,11 @@ def odometry_from(odometer, vehicle=None, config=None):
 
 def align_run(epochs, odometer, vehicle, config):
     """The epochs aligned with an odometer that the first metres turned to growing path."""
-    found = odometry_from(odometer, vehicle, config)
+    return align_with(epochs, odometry_from(odometer, vehicle, config), vehicle, config)
+
+
+def align_with(epochs, found, vehicle, config):
+    """As `align_run`, with what is known of the odometer already."""
     if found is not None:
         placed = epochs["fix_valid"].to_numpy() & epochs["on_track"].to_numpy()
         path_m = np.where(placed, floats(epochs, "path_m"), np.nan)
