@@ -97,7 +97,7 @@ _SLOW = (
 _QUICK = (
     "campaign/test_plan.py",
     "experiment/test_constellation.py",
-    "experiment/test_ranges.py",
+    "experiment/test_rare_recorded.py",
     "show/export/test_gis.py",
     "show/export/test_places.py",
     "studies/line/test_replayed.py",
