@@ -11,14 +11,14 @@ from bisect import bisect_right
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from itertools import chain
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 import polars as pl
 import pyarrow as pa
 
-from pipeline.read.ingest.mcap_block import Bytes, Messages, Stretches
+from pipeline.read.ingest.mcap_block import Bytes, Heads, Messages, joined_heads
 from pipeline.read.ingest.mcap_records import Channel
 from schemas.arrays import Bools, Ints
 from schemas.errors import InputError
@@ -55,7 +55,7 @@ def parse_path(path: str) -> list[str | int]:
 
 Values = npt.NDArray[Any] | pl.Series
 Columns = Mapping[str, Values]
-Decoded = tuple[Messages, Columns]
+Decoded = tuple[Heads, Columns]
 
 
 @frozen
@@ -109,16 +109,25 @@ def text(offset: int, length: int) -> Field:
     """A text of known length."""
 
     def take(rows: Bytes) -> Values:
-        content = pa.py_buffer(np.ascontiguousarray(rows))
-        ends = pa.py_buffer(np.arange(len(rows) + 1, dtype=np.int64) * length)
-        texts = pa.LargeStringArray.from_buffers(len(rows), ends, content)
-        try:
-            texts.validate(full=True)  # refuses what is not UTF-8
-        except pa.ArrowInvalid:
-            raise UndecodableError("a text is not UTF-8") from None
-        return pl.Series(pl.from_arrow(texts))
+        content = np.ascontiguousarray(rows)
+        flat = content.reshape(-1)
+        if np.array_equal(flat[length:], flat[: len(flat) - length]):  # mostly each is as the one before
+            return _texts(content[:1]).new_from_index(0, len(rows))
+        return _texts(content)
 
     return Field(pl.String, offset, offset + length, take)
+
+
+def _texts(content: Bytes) -> pl.Series:
+    """Texts of one length, one in each row."""
+    count, length = content.shape
+    ends = pa.py_buffer(np.arange(count + 1, dtype=np.int64) * length)
+    texts = pa.LargeStringArray.from_buffers(count, ends, pa.py_buffer(content))
+    try:
+        texts.validate(full=True)  # refuses what is not UTF-8
+    except pa.ArrowInvalid:
+        raise UndecodableError("a text is not UTF-8") from None
+    return pl.Series(pl.from_arrow(texts))
 
 
 def constant(value: float | str | bool | None, dtype: pl.DataType) -> Field:
@@ -138,6 +147,12 @@ class ByteStretch:
     at: Ints
     mask: Bytes
     expected: Bytes
+    exact: bool
+
+    def wrong(self, rows: Bytes) -> Bools:
+        """Of the bytes at these places, which do not agree."""
+        found = rows.take(self.at, axis=1)
+        return np.asarray((found if self.exact else found & self.mask) != self.expected)
 
 
 @frozen
@@ -153,17 +168,14 @@ class Layout:
         """Each stretch of each message."""
         return [messages.stretches(stretch.start, stretch.end) for stretch in self.stretches]
 
-    def of(self, stretches: Sequence[Bytes]) -> Bools:
-        """Whether each message has this layout."""
-        wrong = [
-            rows[:, stretch.at] & stretch.mask != stretch.expected
-            for stretch, rows in zip(self.stretches, stretches, strict=True)
-        ]
-        agree = np.ones(len(stretches[0]), dtype=np.bool_)
-        for part in wrong:
-            if part.any():  # mostly none is: then no row of a few bytes has to be looked at for itself
-                agree &= ~part.any(axis=1)
-        return agree
+    def of(self, stretches: Sequence[Bytes]) -> Bools | None:
+        """Which messages have this layout; None where all have."""
+        alike: list[Bools] = []
+        for stretch, rows in zip(self.stretches, stretches, strict=True):
+            wrong = stretch.wrong(rows)
+            if wrong.any():  # mostly none is: then no row of a few bytes has to be looked at for itself
+                alike.append(np.asarray(~wrong.any(axis=1)))
+        return np.logical_and.reduce(alike) if alike else None
 
     def values(self, stretches: Sequence[Bytes]) -> Columns:
         """The fields of messages that have this layout, for each row that they make."""
@@ -175,10 +187,10 @@ class Layout:
 
         return {path: _in_turn([*map(values, fields)]) for path, fields in self.fields.items()}
 
-    def rows_of(self, messages: Messages) -> Messages:
-        """The message of each row."""
+    def heads_of(self, heads: Heads) -> Heads:
+        """Of the message of each row."""
         count = max(map(len, self.fields.values()), default=1)
-        return messages if count == 1 else messages.chosen(np.repeat(np.arange(len(messages)), count))
+        return heads if count == 1 else heads.chosen(np.repeat(np.arange(len(heads.ordinal)), count))
 
 
 def _in_turn(columns: Sequence[Values]) -> Values:
@@ -200,13 +212,16 @@ def layout_of(payload: bytes, static: bytearray, fields: Mapping[str, Sequence[F
     for part in np.split(places, np.flatnonzero(np.diff(places) > _NEAR) + 1):
         start, end = (int(part[0]), int(part[-1]) + 1) if len(part) else (0, 0)
         at = np.flatnonzero(mask[start:end])
-        stretches.append(ByteStretch(start, end, at, mask[start:end][at], (content & mask)[start:end][at]))
+        masks = mask[start:end][at]
+        stretches.append(
+            ByteStretch(start, end, at, masks, content[start:end][at] & masks, bool((masks == 0xFF).all()))
+        )
     return Layout(fields, stretches)
 
 
 def _by_length(messages: Messages) -> Iterator[tuple[int, Messages]]:
     """The messages of each length, in order of the file."""
-    longest = int(messages.length.max())
+    longest = messages.longest
     if longest == messages.length.min():
         yield longest, messages
         return
@@ -217,63 +232,92 @@ def _by_length(messages: Messages) -> Iterator[tuple[int, Messages]]:
         yield int(messages.length[rows[0]]), messages.chosen(rows)
 
 
+class _Waiting(NamedTuple):
+    """A layout, and what waits to be decoded of the messages that have it, block by block."""
+
+    layout: Layout
+    heads: list[Heads]
+    stretches: list[list[Bytes]]
+
+    def taken(self) -> tuple[Layout, Heads, list[Bytes]]:
+        """All of it, and it waits no more."""
+        heads = joined_heads(self.heads)
+        stretches = [np.concatenate(parts) for parts in zip(*self.stretches, strict=True)]
+        self.heads.clear()
+        self.stretches.clear()
+        return self.layout, heads, stretches
+
+
 class LayoutDecoder:
     """Decodes the messages of a channel by their layouts, which it learns as they come.
 
-    `slow_messages`: those whose layout was not kept. Raises `InputError` for a message that cannot be decoded.
+    What the fields and the layout need is taken of each block while that is in the processor's cache, and decoded when
+    somebody asks. `slow_messages`: those whose layout was not kept; `waiting`: bytes that wait to be decoded.
+    Raises `InputError` for a message that cannot be decoded.
     """
 
-    def __init__(self, channel: Channel, walk: Callable[[bytes], Layout]) -> None:
+    def __init__(self, channel: Channel, walk: Callable[[bytes], Layout], with_publish_time: bool = False) -> None:
         self.slow_messages = 0
+        self.waiting = 0
         self._channel = channel
         self._walk = walk
-        self._layouts: dict[int, list[Layout]] = {}
+        self._with_publish_time = with_publish_time
+        self._layouts: dict[int, list[_Waiting]] = {}
         self._kept = 0
+        self._alone: list[Decoded] = []
 
-    @property
-    def wanted(self) -> Stretches:
-        """The stretches of each length of which one layout has been met."""
-        return {
-            length: [(stretch.start, stretch.end) for stretch in layouts[0].stretches]
-            for length, layouts in self._layouts.items()
-            if len(layouts) == 1
-        }
-
-    def decode(self, messages: Messages) -> Iterator[Decoded]:
-        """The fields of all messages, of those of one layout together."""
+    def add(self, messages: Messages) -> None:
+        """Take what is needed of all messages."""
         for length, alike in _by_length(messages):
-            yield from self._by_layout(alike, self._layouts.setdefault(length, []))
+            self._by_layout(alike, self._layouts.setdefault(length, []))
 
-    def _by_layout(self, left: Messages, known: list[Layout]) -> Iterator[Decoded]:
+    def decoded(self) -> Iterator[Decoded]:
+        """The fields of all messages that wait, of those of one layout together."""
+        alone = self._alone
+        self._alone = []
+        self.waiting = 0
+        yield from alone
+        for known in chain.from_iterable(self._layouts.values()):
+            if known.heads:
+                yield self._decoded(*known.taken())
+
+    def _by_layout(self, left: Messages, known: list[_Waiting]) -> None:
         tried = 0
         while len(left):
             if tried == len(known) and not self._learn(left, known):
-                yield self._alone(left.chosen(slice(1)))
+                self._decode_first(left)
                 left = left.chosen(slice(1, None))
                 continue
-            layout = known[tried]
-            tried += 1
+            layout = known[tried].layout
             rows = layout.rows(left)
             agree = layout.of(rows)
-            if agree.all():
-                yield self._decoded(layout, left, rows)
+            if agree is None:
+                self._keep(known[tried], left, rows)
                 return
             if agree.any():
-                yield self._decoded(layout, left.chosen(agree), [stretch[agree] for stretch in rows])
+                self._keep(known[tried], left.chosen(agree), [stretch[agree] for stretch in rows])
             left = left.chosen(~agree)
+            tried += 1
 
-    def _learn(self, messages: Messages, known: list[Layout]) -> bool:
+    def _keep(self, known: _Waiting, messages: Messages, rows: list[Bytes]) -> None:
+        heads = messages.heads(self._with_publish_time)
+        known.heads.append(heads)
+        known.stretches.append(rows)
+        self.waiting += sum(part.nbytes for part in (*heads, *rows) if part is not None)
+
+    def _learn(self, messages: Messages, known: list[_Waiting]) -> bool:
         """Whether the layout of the first message is known from now on."""
         if self._kept >= _MOST_LAYOUTS or messages.length[0] > _LARGEST_KEPT:
             return False
-        known.append(self._layout_of_first(messages))
+        known.append(_Waiting(self._layout_of_first(messages), [], []))
         self._kept += 1
         return True
 
-    def _alone(self, message: Messages) -> Decoded:
+    def _decode_first(self, messages: Messages) -> None:
         self.slow_messages += 1
-        layout = self._layout_of_first(message)
-        return self._decoded(layout, message, layout.rows(message))
+        first = messages.chosen(slice(1))
+        layout = self._layout_of_first(first)
+        self._alone.append(self._decoded(layout, first.heads(self._with_publish_time), layout.rows(first)))
 
     def _layout_of_first(self, messages: Messages) -> Layout:
         try:
@@ -281,12 +325,13 @@ class LayoutDecoder:
         except UndecodableError as error:
             raise undecodable(self._channel, messages.log_time[0], error) from None
 
-    def _decoded(self, layout: Layout, messages: Messages, rows: Sequence[Bytes]) -> Decoded:
+    def _decoded(self, layout: Layout, heads: Heads, rows: Sequence[Bytes]) -> Decoded:
         try:
-            return layout.rows_of(messages), layout.values(rows)
+            return layout.heads_of(heads), layout.values(rows)
         except UndecodableError as error:
-            if len(messages) == 1:
-                raise undecodable(self._channel, messages.log_time[0], error) from None
-        for row in range(len(messages)):  # one of them cannot be decoded
-            self._decoded(layout, messages.chosen(slice(row, row + 1)), [stretch[row : row + 1] for stretch in rows])
+            if len(heads.ordinal) == 1:
+                raise undecodable(self._channel, heads.log_time[0], error) from None
+        for row in range(len(heads.ordinal)):  # one of them cannot be decoded
+            this = slice(row, row + 1)
+            self._decoded(layout, heads.chosen(this), [stretch[this] for stretch in rows])
         raise AssertionError("messages that can be decoded one by one cannot be decoded together")

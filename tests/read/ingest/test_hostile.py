@@ -182,7 +182,8 @@ def test_a_message_without_bytes_at_the_end_of_a_block_is_decoded() -> None:
     fields = {"x": [constant(0.0, pl.Float64())]}
     channel = Channel(1, "/x", "protobuf", None, "x.mcap")
     decoder = LayoutDecoder(channel, lambda payload: layout_of(payload, bytearray(payload), fields))
-    ((_, columns),) = decoder.decode(message)
+    decoder.add(message)
+    ((_, columns),) = decoder.decoded()
     assert list(columns["x"]) == [0.0]
 
 
@@ -196,7 +197,7 @@ def test_pieces_of_a_block_are_one_after_the_other() -> None:
     assert messages.stretches(0, 2).tobytes() == position(0)[:2] * 2
     assert messages.chosen(np.array([False, True])).log_time.tolist() == [START_NS + 1]
     second = len(chunks[0]) + len(chunks[1]) + 31
-    assert messages.ordinal.tolist() == [100 + len(definitions()) + 31, 100 + second]
+    assert messages.heads().ordinal.tolist() == [100 + len(definitions()) + 31, 100 + second]
 
 
 def test_a_number_that_64_bits_with_a_sign_do_not_hold_is_refused() -> None:
