@@ -20,12 +20,13 @@ import pyarrow as pa
 
 from pipeline.read.ingest.mcap_block import Bytes, Heads, Messages, joined_heads
 from pipeline.read.ingest.mcap_records import Channel
-from schemas.arrays import Bools, Ints
+from schemas.arrays import Bools
 from schemas.errors import InputError
 from schemas.frozen import frozen
 
 _MOST_LAYOUTS = 256  # of one channel that are kept
 _LARGEST_KEPT = 1 << 16  # bytes of a message whose layout is kept
+_CHECKED = 64 * 1024  # bytes that are held against a layout at once
 _NEAR = 32  # bytes; what lies nearer is taken together
 _EXACT_INTEGER = 2.0**53
 
@@ -60,12 +61,12 @@ Decoded = tuple[Heads, Columns]
 
 @frozen
 class Field:
-    """Where a value lies in each message, and how it is taken from these bytes of each message, in rows."""
+    """Where a value lies in each message, and how it is taken from these bytes of each message, in rows by block."""
 
     kind: type[pl.DataType]
     start: int
     end: int
-    take: Callable[[Bytes], Values]
+    take: Callable[[Sequence[Bytes]], Values]
 
     def as_type(self, dtype: pl.DataType) -> Field:
         """The field, if its values are of the kind asked for, or numbers that may be."""
@@ -76,43 +77,47 @@ class Field:
         if self.kind is pl.Int64 and isinstance(dtype, pl.String):
             # Ids are names, whatever a message holds them as.
             return replace(
-                self, kind=pl.String, take=lambda rows: pl.Series(np.asarray(self.take(rows))).cast(pl.String)
+                self, kind=pl.String, take=lambda blocks: pl.Series(np.asarray(self.take(blocks))).cast(pl.String)
             )
         raise UndecodableError(f"a field holds {self.kind.__name__}, not {dtype}")
 
-    def values(self, rows: Bytes) -> Values:
+    def values(self, blocks: Sequence[Bytes]) -> Values:
         """As numbers of 64 bits, which must hold what was recorded; other values as they are taken."""
-        values = self.take(rows)
+        values = self.take(blocks)
         if self.kind not in (pl.Int64, pl.Float64) or not isinstance(values, np.ndarray):
             return values
         if self.kind is pl.Float64:
-            return values.astype(np.float64)
+            return values.astype(np.float64, copy=False)
         if values.dtype == np.uint64 and (values >> np.uint64(63)).any():
             raise UndecodableError("a number is larger than a 64-bit integer with a sign")
         if values.dtype.kind == "f" and not ((np.abs(values) < _EXACT_INTEGER) & (np.rint(values) == values)).all():
             raise UndecodableError("a number is not a 64-bit integer")
-        return values.astype(np.int64)
+        return values.astype(np.int64, copy=False)
 
 
 def fixed(offset: int, dtype: str) -> Field:
     """A number of fixed width, as numpy names it (`<f8`)."""
     kind = pl.Float64 if dtype[1] == "f" else pl.Int64
-    return Field(kind, offset, offset + int(dtype[2:]), lambda rows: rows.view(dtype)[:, 0])
+
+    def take(blocks: Sequence[Bytes]) -> Values:
+        return np.concatenate([rows.view(dtype)[:, 0] for rows in blocks])
+
+    return Field(kind, offset, offset + int(dtype[2:]), take)
 
 
 def flag(offset: int) -> Field:
     """A boolean in one byte."""
-    return Field(pl.Boolean, offset, offset + 1, lambda rows: rows[:, 0] != 0)
+    return Field(pl.Boolean, offset, offset + 1, lambda blocks: np.concatenate(blocks)[:, 0] != 0)
 
 
 def text(offset: int, length: int) -> Field:
     """A text of known length."""
 
-    def take(rows: Bytes) -> Values:
-        content = np.ascontiguousarray(rows)
+    def take(blocks: Sequence[Bytes]) -> Values:
+        content = np.concatenate(blocks)
         flat = content.reshape(-1)
         if np.array_equal(flat[length:], flat[: len(flat) - length]):  # mostly each is as the one before
-            return _texts(content[:1]).new_from_index(0, len(rows))
+            return _texts(content[:1]).new_from_index(0, len(content))
         return _texts(content)
 
     return Field(pl.String, offset, offset + length, take)
@@ -134,25 +139,40 @@ def constant(value: float | str | bool | None, dtype: pl.DataType) -> Field:
     """A field that messages of this layout leave out: its default, or null."""
     values = pl.Series([value], dtype=dtype, strict=False)
     if dtype.is_numeric() and value is not None:
-        return Field(type(dtype), 0, 0, lambda rows: np.full(len(rows), values[0], dtype=values.to_numpy().dtype))
-    return Field(type(dtype), 0, 0, lambda rows: values.new_from_index(0, len(rows)))
+        number = values.to_numpy()
+        return Field(type(dtype), 0, 0, lambda blocks: number.repeat(sum(map(len, blocks))))
+    return Field(type(dtype), 0, 0, lambda blocks: values.new_from_index(0, sum(map(len, blocks))))
 
 
-@frozen
 class ByteStretch:
-    """Bytes of a message that are taken together; those `at` some places among them must agree under a mask."""
+    """Bytes of a message that are taken together, and what they must be under a mask."""
 
-    start: int
-    end: int
-    at: Ints
-    mask: Bytes
-    expected: Bytes
-    exact: bool
+    def __init__(self, start: int, end: int, mask: Bytes, expected: Bytes) -> None:
+        self.start = start
+        self.end = end
+        self._mask = mask
+        self._expected = expected
+        self._shapes = bool(mask.any())
+        # The same of several messages, so that many bytes are looked at together.
+        self._masks = mask
+        self._all_expected = expected
 
-    def wrong(self, rows: Bytes) -> Bools:
-        """Of the bytes at these places, which do not agree."""
-        found = rows.take(self.at, axis=1)
-        return np.asarray((found if self.exact else found & self.mask) != self.expected)
+    def unlike(self, rows: Bytes) -> Bools | None:
+        """Which rows are not as expected; None where all are."""
+        if not self._shapes:
+            return None
+        together = min(len(rows), _CHECKED // len(self._mask) + 1) * len(self._mask)
+        if len(self._masks) < together:
+            self._masks = np.resize(self._mask, together)
+            self._all_expected = np.resize(self._expected, together)
+        flat = rows.reshape(-1)
+        for at in range(0, len(flat), together):
+            part = flat[at : at + together]
+            wrong = (part ^ self._all_expected[: len(part)]) & self._masks[: len(part)]
+            # Mostly nothing is: then no row of a few bytes has to be looked at for itself.
+            if np.bitwise_or.reduce(wrong):
+                return np.asarray(((rows ^ self._expected) & self._mask).any(axis=1))
+        return None
 
 
 @frozen
@@ -170,20 +190,18 @@ class Layout:
 
     def of(self, stretches: Sequence[Bytes]) -> Bools | None:
         """Which messages have this layout; None where all have."""
-        alike: list[Bools] = []
-        for stretch, rows in zip(self.stretches, stretches, strict=True):
-            wrong = stretch.wrong(rows)
-            if wrong.any():  # mostly none is: then no row of a few bytes has to be looked at for itself
-                alike.append(np.asarray(~wrong.any(axis=1)))
-        return np.logical_and.reduce(alike) if alike else None
+        found = [stretch.unlike(rows) for stretch, rows in zip(self.stretches, stretches, strict=True)]
+        unlike = [rows for rows in found if rows is not None]
+        return ~np.logical_or.reduce(unlike) if unlike else None
 
-    def values(self, stretches: Sequence[Bytes]) -> Columns:
-        """The fields of messages that have this layout, for each row that they make."""
+    def values(self, blocks: Sequence[Sequence[Bytes]]) -> Columns:
+        """The fields of messages that have this layout, for each row that they make; `blocks`: their stretches."""
         starts = [stretch.start for stretch in self.stretches]
 
         def values(field: Field) -> Values:
             number = bisect_right(starts, field.start) - 1
-            return field.values(stretches[number][:, field.start - starts[number] : field.end - starts[number]])
+            places = slice(field.start - starts[number], field.end - starts[number])
+            return field.values([stretches[number][:, places] for stretches in blocks])
 
         return {path: _in_turn([*map(values, fields)]) for path, fields in self.fields.items()}
 
@@ -211,11 +229,7 @@ def layout_of(payload: bytes, static: bytearray, fields: Mapping[str, Sequence[F
     stretches = []
     for part in np.split(places, np.flatnonzero(np.diff(places) > _NEAR) + 1):
         start, end = (int(part[0]), int(part[-1]) + 1) if len(part) else (0, 0)
-        at = np.flatnonzero(mask[start:end])
-        masks = mask[start:end][at]
-        stretches.append(
-            ByteStretch(start, end, at, masks, content[start:end][at] & masks, bool((masks == 0xFF).all()))
-        )
+        stretches.append(ByteStretch(start, end, mask[start:end], content[start:end]))
     return Layout(fields, stretches)
 
 
@@ -239,10 +253,9 @@ class _Waiting(NamedTuple):
     heads: list[Heads]
     stretches: list[list[Bytes]]
 
-    def taken(self) -> tuple[Layout, Heads, list[Bytes]]:
+    def taken(self) -> tuple[Layout, Heads, list[list[Bytes]]]:
         """All of it, and it waits no more."""
-        heads = joined_heads(self.heads)
-        stretches = [np.concatenate(parts) for parts in zip(*self.stretches, strict=True)]
+        heads, stretches = joined_heads(self.heads), [*self.stretches]
         self.heads.clear()
         self.stretches.clear()
         return self.layout, heads, stretches
@@ -317,7 +330,7 @@ class LayoutDecoder:
         self.slow_messages += 1
         first = messages.chosen(slice(1))
         layout = self._layout_of_first(first)
-        self._alone.append(self._decoded(layout, first.heads(self._with_publish_time), layout.rows(first)))
+        self._alone.append(self._decoded(layout, first.heads(self._with_publish_time), [layout.rows(first)]))
 
     def _layout_of_first(self, messages: Messages) -> Layout:
         try:
@@ -325,13 +338,14 @@ class LayoutDecoder:
         except UndecodableError as error:
             raise undecodable(self._channel, messages.log_time[0], error) from None
 
-    def _decoded(self, layout: Layout, heads: Heads, rows: Sequence[Bytes]) -> Decoded:
+    def _decoded(self, layout: Layout, heads: Heads, blocks: Sequence[Sequence[Bytes]]) -> Decoded:
         try:
-            return layout.heads_of(heads), layout.values(rows)
+            return layout.heads_of(heads), layout.values(blocks)
         except UndecodableError as error:
             if len(heads.ordinal) == 1:
                 raise undecodable(self._channel, heads.log_time[0], error) from None
+        stretches = [np.concatenate(of_blocks) for of_blocks in zip(*blocks, strict=True)]
         for row in range(len(heads.ordinal)):  # one of them cannot be decoded
             this = slice(row, row + 1)
-            self._decoded(layout, heads.chosen(this), [stretch[this] for stretch in rows])
+            self._decoded(layout, heads.chosen(this), [[stretch[this] for stretch in stretches]])
         raise AssertionError("messages that can be decoded one by one cannot be decoded together")

@@ -161,7 +161,7 @@ def piece_of_chunk(
     offset: int,
     on_record: OnRecord,
     allowance: Allowance,
-    indexes: Sequence[tuple[int, bytes]] = (),
+    indexes: Sequence[tuple[int, memoryview]] = (),
     on_odd_index: Callable[[DamageError], None] = _refuse,
 ) -> Piece:
     """The messages of a chunk, which its records must fill exactly; other records go to `on_record`.
@@ -186,7 +186,7 @@ def piece_of_chunk(
     return piece
 
 
-def _agree(piece: Piece, indexes: Sequence[tuple[int, bytes]]) -> bool:
+def _agree(piece: Piece, indexes: Sequence[tuple[int, memoryview]]) -> bool:
     """An index names all messages of its channel, each once: a reader that trusts it would lose some else."""
     for channel, entries in indexes:
         part = piece.parts.get(channel)
@@ -197,7 +197,7 @@ def _agree(piece: Piece, indexes: Sequence[tuple[int, bytes]]) -> bool:
     return True
 
 
-def _listed(data: Bytes, offset: int, indexes: Sequence[tuple[int, bytes]]) -> tuple[int, Piece] | None:
+def _listed(data: Bytes, offset: int, indexes: Sequence[tuple[int, memoryview]]) -> tuple[int, Piece] | None:
     """Where the first message begins, and all by their indexes; none unless they follow each other from there to the
     end and are as the indexes list them.
     """
@@ -233,11 +233,11 @@ def _listed(data: Bytes, offset: int, indexes: Sequence[tuple[int, bytes]]) -> t
     return first, Piece(data, parts, offset)
 
 
-def _by_channel(indexes: Sequence[tuple[int, bytes]]) -> dict[int, Ints]:
+def _by_channel(indexes: Sequence[tuple[int, memoryview]]) -> dict[int, Ints]:
     """Log time and start of the messages of each channel, in the order of their starts."""
-    entries: dict[int, bytes] = {}
+    entries: dict[int, memoryview] = {}
     for channel, more in indexes:
-        entries[channel] = entries[channel] + more if channel in entries else more
+        entries[channel] = memoryview(bytes(entries[channel]) + more) if channel in entries else more
     tables = {channel: np.frombuffer(of_channel, dtype="<i8").reshape(-1, 2) for channel, of_channel in entries.items()}
     for channel, table in tables.items():
         if (table[1:, 1] < table[:-1, 1]).any():

@@ -250,9 +250,9 @@ class McapWalk:
         self._keep(piece_of_chunk(content, position, self._chunk_record, self._allowance, indexes, self.met.add_orphan))
         return end
 
-    def _indexes(self, position: int, chunk: int, room: int) -> tuple[list[tuple[int, bytes]], int]:
+    def _indexes(self, position: int, chunk: int, room: int) -> tuple[list[tuple[int, memoryview]], int]:
         """Channel and entries of the message indexes of a chunk, and the position behind them or a cut in them."""
-        indexes: list[tuple[int, bytes]] = []
+        indexes: list[tuple[int, memoryview]] = []
         while position + HEAD_SIZE <= self._size:
             opcode, length = HEAD.unpack(self._read(position, HEAD_SIZE))
             if opcode != Opcode.MESSAGE_INDEX or position + HEAD_SIZE + length > self._size:
