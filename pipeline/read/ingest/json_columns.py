@@ -1,6 +1,7 @@
-"""JSON messages to columns by pyarrow, whose parser holds every value against the type asked for.
+"""JSON messages to columns: at once where all hold the same fields, else by pyarrow.
 
-What pyarrow refuses or may misread (a text over several lines, 9.0 for a whole number) is parsed message by message.
+Both hold every value against the type asked for. What pyarrow refuses or may misread (a text over several lines, 9.0
+for a whole number) is parsed message by message.
 """
 
 from __future__ import annotations
@@ -8,6 +9,7 @@ from __future__ import annotations
 import json
 import re
 from collections.abc import Iterable, Iterator, Mapping
+from contextlib import suppress
 from typing import Any, Literal
 
 import numpy as np
@@ -15,6 +17,7 @@ import polars as pl
 import pyarrow as pa
 import pyarrow.json
 
+from pipeline.read.ingest.json_typed import TypedMessages, typed_messages
 from pipeline.read.ingest.layout import Columns, Decoded, UndecodableError, Values, parse_path, undecodable
 from pipeline.read.ingest.mcap_block import Heads, Messages, joined_heads
 from pipeline.read.ingest.mcap_records import Channel
@@ -49,6 +52,8 @@ class JsonDecoder:
         self._schema = pa.schema(list(_struct(tree)))
         self._met: pa.Schema | None = None  # what of it the first messages held, while no other has held more
         self._narrow = True
+        self._typed: TypedMessages | None = None  # while all messages hold what the first did
+        self._is_first = True
         self._content: list[memoryview] = []
         self._lengths: list[Ints] = []
         self._heads: list[Heads] = []
@@ -71,16 +76,28 @@ class JsonDecoder:
         self._content.clear()
         self._lengths.clear()
         self._heads.clear()
+        columns = self._at_once(texts) if texts.are_between_braces() else None
+        if columns is None:
+            self.slow_messages += len(texts)
+            columns = one_by_one(self._channel, texts, heads.log_time, self._types)
+        yield heads, columns
+
+    def _at_once(self, texts: _Texts) -> Columns | None:
+        """The fields of messages each between braces: as many objects as messages are then one each."""
+        if self._is_first:
+            self._is_first = False
+            with suppress(UndecodableError):
+                self._typed = typed_messages(self._types, parse_json(next(iter(texts))))
+        if self._typed is not None:
+            columns = self._typed.columns(texts.content, len(texts))
+            if columns is not None:
+                return columns
+            self._typed = None
         try:
             table = self._parsed(texts.content) if texts.are_plain() else None
         except pa.ArrowInvalid:
-            table = None
-        # Every text starts and ends as an object does: so many objects as messages are one each.
-        if table is not None and table.num_rows == len(texts.lengths):
-            yield heads, self._columns(table)
-        else:
-            self.slow_messages += len(texts.lengths)
-            yield heads, one_by_one(self._channel, texts, heads.log_time, self._types)
+            return None
+        return self._columns(table) if table is not None and table.num_rows == len(texts) else None
 
     def _columns(self, table: pa.Table) -> Columns:
         frame = pl.DataFrame(pl.from_arrow(table))
@@ -149,30 +166,31 @@ def _value(path: str) -> pl.Expr:
 
 
 class _Texts:
-    """The texts of messages, one after the other, with a byte before each."""
+    """The texts of messages, one after the other, on a line each; `content` has a byte before each for that."""
 
     def __init__(self, content: bytearray, lengths: Ints) -> None:
         self.content = content
         self.lengths = lengths
         self._ends = np.cumsum(lengths + 1)
         self._bytes = np.frombuffer(content, dtype=np.uint8)
+        self._bytes[self._ends - lengths - 1] = ord("\n")
+
+    def __len__(self) -> int:
+        return len(self.lengths)
 
     def __iter__(self) -> Iterator[bytes]:
         for end, length in zip(self._ends.tolist(), self.lengths.tolist(), strict=True):
             yield bytes(self.content[end - length : end])
 
     def are_plain(self) -> bool:
-        """Whether each is the UTF-8 text of something between braces; a line each from then on."""
-        self._bytes[self._ends - self.lengths - 1] = ord("\n")
+        """Whether all is UTF-8, and nothing in it that pyarrow would misread."""
         content = self.content
         # A letter is found ten times as fast as a word.
         strange = any(word[:1] in content and word in content for word in _LITERALS) and _AS_VALUE.search(content)
-        if strange or (b"null" in content and _NULL_AFTER.search(content)) or not _is_utf8(content):
-            return False
-        return self._all_between_braces()
+        return not (strange or (b"null" in content and _NULL_AFTER.search(content))) and _is_utf8(content)
 
-    def _all_between_braces(self) -> bool:
-        """But for white space around it."""
+    def are_between_braces(self) -> bool:
+        """Whether each is something between braces, but for white space around it."""
         if not self.lengths.all():
             return False
         starts = self._ends - self.lengths
