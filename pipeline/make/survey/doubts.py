@@ -9,7 +9,7 @@ import numpy as np
 from pipeline.make.survey.network import SurveyNetwork
 from pipeline.make.survey.pieces import LinePiece, kilometre_spans
 from pipeline.stages.paths.candidates import candidates_of, segments_of
-from pipeline.stages.track.geodesy import points_of, way_m
+from pipeline.stages.track.geodesy import distance_along_m, points_of
 from pipeline.stages.track.network import Network, network_of
 from pipeline.stages.track.segments import SAMPLE_SPACING_M
 from pipeline.stages.track.survey import in_pieces, places_along, track_of
@@ -61,7 +61,7 @@ def _kinks(element: LinePiece, config: SurveyConfig) -> Iterator[Finding]:
 
 
 def _kilometres(element: LinePiece, config: SurveyConfig) -> Iterator[Finding]:
-    way = way_m(element.surface)
+    way = distance_along_m(element.surface)
     known, off_m, jumps = kilometre_spans(element.line_km, way, config)
     if jumps.any():
         row = int(np.argmax(np.where(jumps, off_m, 0.0)))

@@ -10,7 +10,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from pipeline.make.survey.pieces import LinePiece, Survey
-from pipeline.stages.track.geodesy import way_m
+from pipeline.stages.track.geodesy import distance_along_m
 from schemas.arrays import Bools, Floats, Ints, spans_of
 from schemas.config import SurveyConfig
 
@@ -75,7 +75,7 @@ def _new_track(piece: LinePiece, name: str, survey: Survey, config: SurveyConfig
     known = list(survey.pieces)
     for lap in _split_at_repeats(piece, config):
         covered = _covered(lap.surface, known, config.same_track_m)
-        way = way_m(lap.surface)
+        way = distance_along_m(lap.surface)
         for first, last in spans_of(~covered):
             if way[last] - way[first] >= config.toe_m:
                 parts.append(_with_toes(lap, first, last, known, config.toe_m))
@@ -90,7 +90,7 @@ def _new_track(piece: LinePiece, name: str, survey: Survey, config: SurveyConfig
 def _split_at_repeats(piece: LinePiece, config: SurveyConfig) -> Iterator[LinePiece]:
     """A pass cut where it turns back or comes to where it was, so that each lap covers a place once."""
     places = piece.surface
-    way = way_m(places)
+    way = distance_along_m(places)
     rows = np.arange(len(piece))
     if not rows.size:
         return
@@ -151,7 +151,7 @@ def _dense(places: Floats) -> Floats:
     """Points at most a metre apart along a line."""
     if len(places) < 2:
         return places
-    way = way_m(places)
+    way = distance_along_m(places)
     at = np.linspace(0.0, way[-1], int(way[-1]) + 2)
     return np.column_stack([np.interp(at, way, places[:, axis]) for axis in range(3)])
 

@@ -11,7 +11,7 @@ import polars as pl
 
 from pipeline.stages.lds.crossings import DEFAULTS, minimal_spacing_m, window_m
 from pipeline.stages.paths.candidates import candidates_of, search_about
-from pipeline.stages.paths.path_tests import told_by_a_switch_m, told_by_offset_m
+from pipeline.stages.paths.path_tests import offset_resolution_m, switch_resolution_m
 from pipeline.stages.track.geodesy import points_of
 from pipeline.stages.track.network import Edge, Network, network_of, surveyed
 from pipeline.stages.track.path import Chain, search, valid_along_measure
@@ -180,8 +180,8 @@ def tracks_told(track: SurveyedTrack, config: MatchingConfig) -> TracksTold:
     survey_m = _survey_m(track, config)
     return TracksTold(
         survey_m,
-        told_by_offset_m(survey_m, config.paths_alpha, config.cross_bias_sigma_m),
-        told_by_a_switch_m(survey_m, config.paths_alpha, config.paths_alike_m),
+        offset_resolution_m(survey_m, config.paths_alpha, config.cross_bias_sigma_m),
+        switch_resolution_m(survey_m, config.paths_alpha, config.paths_alike_m),
     )
 
 
@@ -231,7 +231,7 @@ def _finding(site: Site, network: Network, stretch: _ParallelStretch, config: Ma
     name = network.track.ids[stretch.element]
     parallel = network.track.ids[stretch.other]
     survey_m = _survey_m(network.track, config)[stretch.element]
-    needed_m = float(told_by_a_switch_m(survey_m, config.paths_alpha, config.paths_alike_m))
+    needed_m = float(switch_resolution_m(survey_m, config.paths_alpha, config.paths_alike_m))
     by_a_switch = (
         f"a switch taken tells them apart at a survey of {survey_m:.2g} m"
         if stretch.apart_m > needed_m

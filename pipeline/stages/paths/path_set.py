@@ -174,7 +174,7 @@ class PathSet:
         return found
 
 
-# Numerics: lines over the switches passed on the way that are looked at; on more of them no way back is seen.
+# Numerics: lines over the switches passed meanwhile that are looked at; on more of them no return is found.
 _LINES = 24
 
 
@@ -222,7 +222,7 @@ class ReturnSearch:
     def _over_switches(self, left: Left, window: int) -> Iterator[int]:
         """Windows by which they have moved back on a line beyond a switch.
 
-        Behind it a branch moves aside as well as positions do: what counts is a movement beside all tracks within
+        Behind it a branch moves aside as well as positions do: what counts is a movement relative to all tracks within
         reach at once, which keep their distances from one another meanwhile.
         """
         lines = self._lines(left)
@@ -246,7 +246,7 @@ class ReturnSearch:
                     break
 
     def _stays(self, means_m: Floats, left: Left, window: int) -> Bools:
-        """It lies where it lay before for as long again: what only passes on its way to somewhere else does not."""
+        """It lies where it lay before for as long again: what only passes on towards somewhere else does not."""
         near = np.abs(means_m) <= self.config.paths_back_sigmas * self._root_m(left, means_m.size)
         stays: Bools = np.convolve(near, np.ones(window + 1))[: near.size] > window
         return stays
@@ -264,15 +264,15 @@ class ReturnSearch:
         """
         count = len(self.steps)
         nearest_m = np.full(count, np.inf)
-        beside_m = np.full(count, np.nan)
+        offset_m = np.full(count, np.nan)
         for one in line:
             rows = self.candidates.of(one // 2, left.died, count)
             rows = rows[self.candidates.beyond_m[rows] <= self.config.paths_end_m]
             rows = rows[self.candidates.distance_m[rows] < nearest_m[self.candidates.step[rows]]]
             step = self.candidates.step[rows]
             nearest_m[step] = self.candidates.distance_m[rows]
-            beside_m[step] = self.candidates.offset_m[rows] * (1.0 - 2.0 * (one % 2))
-        return np.asarray(sliding_window_view(beside_m[left.died :], window) - left.before_m)
+            offset_m[step] = self.candidates.offset_m[rows] * (1.0 - 2.0 * (one % 2))
+        return np.asarray(sliding_window_view(offset_m[left.died :], window) - left.before_m)
 
     def _lines(self, left: Left) -> list[set[int]]:
         """The line with every choice at the switches ahead, and with every one behind; none beyond what is near."""

@@ -67,7 +67,8 @@ NO_STEPS = Totals(*(0.0 for _ in range(6)))
 
 
 class Stretch(NamedTuple):
-    """Of a path at successive steps: residuals, sigmas of the survey, ways to the nearest tracks left and right [m].
+    """Of a path at successive steps: residuals, sigmas of the survey, distances to the nearest tracks left and right
+    [m].
 
     These are 0 where none is within reach; `heading_rad`: of the path, in whose sense residuals and sides are.
     """
@@ -132,10 +133,12 @@ class PathTests:
                 measured_m2[number] = _measured_m2(steps, window_s)
         return cls(alone, measured_m2, _excess(steps, measured_m2), late, early_end, early, config)
 
-    def offset_m(self, sigma_m: Floats, survey_m: Floats, beside_m: Floats) -> Floats:
-        """How far beside its track a single step may lie, another one being so far away there, 0 for none [m]."""
+    def offset_m(self, sigma_m: Floats, survey_m: Floats, track_spacing_m: Floats) -> Floats:
+        """How far off its track a single step may lie, another one being so far away there, 0 for none [m]."""
         root_m = np.sqrt(self.config.cross_bias_sigma_m**2 + survey_m**2 + sigma_m**2)
-        return np.asarray(root_m * self._limits_of_offsets(root_m, beside_m, LOOKED_S / self.config.paths_level_s))
+        return np.asarray(
+            root_m * self._limits_of_offsets(root_m, track_spacing_m, LOOKED_S / self.config.paths_level_s)
+        )
 
     def moved_m(self, sigma_m: Floats, survey_m: Floats) -> Floats:
         """By more than so much two means of `paths_level_s`, a while apart, differ on no path [m]."""
@@ -194,7 +197,8 @@ class PathTests:
         return Verdict(int(at[first[0]]) if first.size else 2**62, np.minimum.accumulate(p))
 
     def _step_terms(self, steps: PathSteps, begin: int, along: Stretch) -> Floats:
-        """Per step 1, residual, sigma of the survey, square of the position's, tracks beside, normal (north, east).
+        """Per step 1, residual, sigma of the survey, square of the position's, tracks to both sides, normal (north,
+        east).
 
         Zeros where it does not count; shape (8, n).
         """
@@ -247,7 +251,7 @@ class PathTests:
         return self._in_sigmas(part, part[0] >= least, self.excess[at], LOOKED_S / self.config.paths_level_s)
 
     def _lasting(self, steps: PathSteps, sums: Floats, trail: Trail, at: Ints) -> _Test:
-        """The mean of the whole way."""
+        """The mean over the whole path."""
         own = sums[:, at + 1 - trail.start] - sums[:, [trail.begin - trail.start]]
         part = own[: len(NO_STEPS)] + np.array(trail.before)[:, None]
         lasted_s = np.maximum(steps.end_s[at] - steps.end_s[trail.first], 1e-9)
@@ -260,21 +264,21 @@ class PathTests:
         root_m = np.sqrt(self.config.cross_bias_sigma_m**2 + mean[1] ** 2 + mean[2] * share)
         sigmas = np.where(usable & (root_m > 0.0), np.abs(mean[0]) / np.maximum(root_m, 1e-9), 0.0)
         # If the train is on it all the same, the track on the side of the positions is left instead.
-        beside_m = np.where(mean[0] > 0.0, mean[3], mean[4])
-        return _Test(sigmas[None], self._limits_of_offsets(root_m, beside_m, looks)[None], np.array([looks]))
+        track_spacing_m = np.where(mean[0] > 0.0, mean[3], mean[4])
+        return _Test(sigmas[None], self._limits_of_offsets(root_m, track_spacing_m, looks)[None], np.array([looks]))
 
-    def _limits_of_offsets(self, root_m: Floats, beside_m: Floats, looks: float) -> Floats:
+    def _limits_of_offsets(self, root_m: Floats, track_spacing_m: Floats, looks: float) -> Floats:
         """Limits in sigmas of an offset, another track being so far away, 0 for none."""
-        beside = np.where(beside_m > 0.0, beside_m / np.maximum(root_m, 1e-9), np.inf)
-        return _limits_beside(beside, self.config.paths_alpha, looks)
+        spacing = np.where(track_spacing_m > 0.0, track_spacing_m / np.maximum(root_m, 1e-9), np.inf)
+        return _limits_by_spacing(spacing, self.config.paths_alpha, looks)
 
 
-def told_by_a_switch_m(survey_m: Floats, alpha: float, merged_m: float) -> Floats:
+def switch_resolution_m(survey_m: Floats, alpha: float, merged_m: float) -> Floats:
     """How far apart tracks have to be for a movement from one to the other to be seen, with exact positions [m]."""
     return np.asarray(_size(alpha, LOOKED_S / WINDOWS_S[0]) * np.sqrt(2.0) * survey_m + 2.0 * merged_m)
 
 
-def told_by_offset_m(survey_m: Floats, alpha: float, bias_m: float) -> Floats:
+def offset_resolution_m(survey_m: Floats, alpha: float, bias_m: float) -> Floats:
     """How far apart tracks have to be for a lasting offset to tell them apart, with exact positions [m]."""
     return np.asarray(_size(alpha, _LASTING_LOOKS) * np.hypot(bias_m, survey_m))
 
@@ -290,16 +294,16 @@ def _sizes(alpha: float, looks: Floats) -> Floats:
     return np.asarray(-ndtri(alpha / (_TESTS * looks * 2.0)))
 
 
-def _limits_beside(beside: Floats, alpha: float, looks: float) -> Floats:
-    """Limits of an offset where another track lies so many of its sigmas beside the path, infinite: none [sigmas].
+def _limits_by_spacing(spacing: Floats, alpha: float, looks: float) -> Floats:
+    """Limits of an offset where another track lies so many of its sigmas away from the path, infinite: none [sigmas].
 
-    As seldom as its level says an offset refutes the true track and leaves the one beside it: a wrong claim. It makes a
-    right one as often as the other track is beyond the limit while the train is on this one. Where that is seldom too,
-    the limit grows until of both together no more are wrong than claims may be; at the most up to that of a level as
-    much smaller, for what is more seldom is claimed in no run.
+    As seldom as its level says an offset refutes the true track and leaves the neighbouring one: a wrong claim. It
+    makes a right one as often as the other track is beyond the limit while the train is on this one. Where that is
+    seldom too, the limit grows until of both together no more are wrong than claims may be; at the most up to that of a
+    level as much smaller, for what is more seldom is claimed in no run.
     """
     limits, needed = _limits_and_needed(alpha, looks)
-    return np.interp(-beside, -needed, limits)
+    return np.interp(-spacing, -needed, limits)
 
 
 @cache
@@ -310,9 +314,9 @@ def _limits_and_needed(alpha: float, looks: float) -> tuple[Floats, Floats]:
     share = 1.0 - ONE_TRACK_LEFT
     limits = np.linspace(_size(alpha, looks), _size(alpha * share, looks), 100)
     # So often the other track has to be beyond the limit, and so far away it is.
-    told = looks * _tails(limits) / share
-    limits, told = limits[told < 1.0], told[told < 1.0]
-    return limits, limits + ndtri(told)
+    rate = looks * _tails(limits) / share
+    limits, rate = limits[rate < 1.0], rate[rate < 1.0]
+    return limits, limits + ndtri(rate)
 
 
 def _tails(sigmas: Floats) -> Floats:

@@ -1,6 +1,6 @@
 """WGS 84 positions as metres, right over any distance a site may span.
 
-No plane serves a line of 100 km: lengths are chords of the ellipsoid, and everything beside the track is
+No plane serves a line of 100 km: lengths are chords of the ellipsoid, and everything across the track is
 measured in the tangent plane of the point itself.
 """
 
@@ -61,8 +61,15 @@ def steps_m(places: Floats) -> Floats:
     return np.asarray(np.sqrt(np.einsum("ij,ij->i", steps, steps)))
 
 
-def way_m(places: Floats) -> Floats:
-    """Distance of each of some places from the first of them, along the line that they make [m]."""
+def distance_along_m(places: Floats) -> Floats:
+    """Running distance along a polyline.
+
+    Args:
+        places: earth-centred vertices in order [m], shape (n, 3).
+
+    Returns:
+        Distance of each vertex from the first one along the line [m], shape (n,).
+    """
     return np.concatenate([np.zeros(min(1, len(places))), np.cumsum(np.linalg.norm(np.diff(places, axis=0), axis=1))])
 
 

@@ -1,8 +1,8 @@
 """The surveyed track as arrays: net elements with their vertices, measures and lengths; and in pieces.
 
 Elements that turn round come in pieces that do not. A balloon loop whose ends join the same switch, a ring, a ramp that
-crosses itself, a road up and down beside itself: the nearest place on the whole element may be the wrong one of two,
-that on a piece never is.
+crosses itself, a line that returns parallel to itself: the nearest place on the whole element may be the wrong one of
+two, that on a piece never is.
 """
 
 from __future__ import annotations
@@ -82,7 +82,7 @@ class SurveyedTrack:
         """The same elements with these measures [m]."""
         length_m = measure_m[self.first[1:] - 1] - measure_m[self.first[:-1]]
         again = replace(self, measure_m=measure_m, length_m=length_m)
-        # Places and ways do not depend on measures.
+        # Places and distances do not depend on measures.
         vars(again).update(surface=self.surface, geometric_m=self.geometric_m)
         return again
 
