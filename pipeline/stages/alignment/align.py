@@ -27,7 +27,20 @@ BEYOND_SPAN = NotEvaluated.BEYOND_SPAN
 def align(
     positions: MatchedEpochs, odometry: Odometry | None, vehicle: Vehicle, config: Configuration
 ) -> AlignedEpochs:
-    """Positions of one solution with the odometer beside them; `odometry` grows with the path of the positions."""
+    """Positions of one solution with the odometer at each, and what a test along the track has to allow for.
+
+    Args:
+        positions: matched epochs of one solution, arrays of shape (n,).
+        odometry: the odometer, growing with the path of the positions; None without one.
+        vehicle: scale and latency, as far as the file gives them.
+        config: the configuration; used are `align`, `monitors`, `lds` and `matching`.
+
+    Returns:
+        The aligned epochs, arrays of shape (n,).
+
+    Source:
+        DOMAIN sections 3 and 4; DIAG eq. 1-3.
+    """
     most_m = config.scatter_limit_m
     positions = replace(
         positions,
@@ -101,15 +114,15 @@ def _allowed(positions: MatchedEpochs, config: Configuration) -> _Allowed:
 
 
 def unrolled(epochs: MatchedEpochs) -> Floats:
-    """Path position less what a curve adds to the way of a position beside the track [m]; NaN off the track.
+    """Path position less what a curve adds to the movement of a position off the track's axis [m]; NaN off the track.
 
     A point y to the left of a track with left curvature k moves dx / (1 - k y) along it while the train moves dx.
     """
     along = np.full(epochs.height, np.nan)
     rows = np.flatnonzero(epochs.near_track)
     path_m = epochs.path_m[rows]
-    beside = np.nan_to_num(epochs.curvature_per_m[rows] * epochs.cross_track_m[rows])
-    along[rows] = path_m - np.cumsum(beside * np.diff(path_m, prepend=path_m[:1]))
+    share = np.nan_to_num(epochs.curvature_per_m[rows] * epochs.cross_track_m[rows])
+    along[rows] = path_m - np.cumsum(share * np.diff(path_m, prepend=path_m[:1]))
     return along
 
 
@@ -124,9 +137,9 @@ def odometer_at(at_ns: Ints, aligned: AlignedEpochs, odometry: Odometry) -> Floa
     anchor_s = odometry.seconds(aligned.t_ns[anchors]) - aligned.latency_s[anchors]
     at_s = odometry.seconds(at_ns)
     near = (np.searchsorted(anchor_s, at_s, side="right") - 1).clip(0)
-    way = odometry.distance_at_s(at_s) - odometry.distance_at_s(anchor_s[near])
+    moved_m = odometry.distance_at_s(at_s) - odometry.distance_at_s(anchor_s[near])
     whole = odometry.doubt_at_s(at_s) == odometry.doubt_at_s(anchor_s[near])
-    distance = aligned.odometer_m[anchors[near]] + aligned.odometer_scale[anchors[near]] * way
+    distance = aligned.odometer_m[anchors[near]] + aligned.odometer_scale[anchors[near]] * moved_m
     return np.where(odometry.known_at_s(at_s) & whole, distance, np.nan)
 
 
@@ -185,7 +198,9 @@ def _with_odometer(
 
 
 def _direction(speed_mps: Floats, deadband_mps: float) -> Ints:
-    """+1 or -1 along growing path, held inside the dead band; the path grows the way that the run begins."""
+    """+1 or -1 along growing path, held inside the dead band; the path grows in the direction in which the run
+    begins.
+    """
     known_mps = np.nan_to_num(speed_mps)
     moving = np.abs(known_mps) > deadband_mps
     last = np.maximum.accumulate(np.where(moving, np.arange(moving.size), -1))

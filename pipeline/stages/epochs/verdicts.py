@@ -46,6 +46,7 @@ class Verdicts:
 
     @property
     def fails(self) -> Bools:
+        """Epochs at which the monitor fails."""
         return np.asarray(self.state == FAIL)
 
     def without_passes(self, reason: NotEvaluated) -> Verdicts:
@@ -75,10 +76,18 @@ def states_of(value: Floats, threshold: Floats, evaluated: Bools) -> States:
 
 
 def verdicts(value: Floats, threshold: Floats, reasons: Ints, state: States | None = None) -> Verdicts:
-    """The verdicts of a monitor; `reasons`: why it is not evaluated, `NO_REASON` where it is (`first_reason`).
+    """The verdicts of a monitor.
 
-    `state` where the monitor gives it already. Else what has no reason and yet no value or threshold is not
-    evaluated either: absence is never health.
+    What has no reason and yet no value or threshold is not evaluated either: absence is never health.
+
+    Args:
+        value: what is tested, in the unit of the monitor, shape (n,).
+        threshold: beyond it the monitor fails, shape (n,).
+        reasons: why it is not evaluated, by number, `NO_REASON` where it is (`first_reason`), shape (n,).
+        state: states by number, where the monitor gives them already, shape (n,).
+
+    Returns:
+        Verdicts of n rows, NaN where not evaluated.
     """
     unexplained = reasons == NO_REASON
     if state is None:
@@ -156,7 +165,16 @@ class FailureLog:
 
 
 def failure_log(epochs: pl.DataFrame, recovery_s: float) -> FailureLog:
-    """Of one solution's epochs, with `negated`; monitors that the frame does not hold were not evaluated."""
+    """Fails and alarms of one solution.
+
+    Args:
+        epochs: its epochs in order, with `t`, `negated` and the columns of the monitors; monitors that the frame does
+            not hold were not evaluated.
+        recovery_s: fails no farther apart are one alarm [s].
+
+    Returns:
+        Failing epochs with their first monitor, and the alarms.
+    """
     t_ns = times_ns(epochs)
     monitors = [name for name in MONITORS if f"{name}_state" in epochs.columns]
     columns = [_fails(epochs[f"{name}_state"]) for name in monitors]

@@ -9,7 +9,7 @@ from functools import cached_property
 import numpy as np
 
 from pipeline.stages.evidence.anchors import KnownStretch, Stand, still_standing
-from pipeline.stages.evidence.carrying import Counter, Interval, RecorderClock, between_anchors, carried
+from pipeline.stages.evidence.carrying import Interval, RecorderClock, SignedOdometer, between_anchors, carried
 from pipeline.stages.evidence.contradictions import KnownPath
 from pipeline.stages.evidence.gaps import Carried, Gap, GapChain
 from pipeline.stages.track.network import Network
@@ -86,17 +86,16 @@ class _Shown:
 class TrainEvidence:
     """All evidence of a run.
 
-    `silent`: times with reference samples that lie on no track. `carried`: by each odometer from reads and the ends of
-    the reference, outside its time; `by_reads`: from reads alone, over the whole run. `stood`: times over which the
+    `off_track`: times with reference samples that lie on no track. `carried`: by each odometer from reads and the ends
+    of the reference, outside its time; `by_reads`: from reads alone, over the whole run. `stood`: times over which the
     odometer carries nothing from one side. `stands`: ends of recordings at which the train stood; `parted`: an odometer
-    of unknown origin parts from an independent one; `doubted`: steps and drifts of the reference that an odometer
-    or a read contradicts, and clocks that change; `unsure`: times in which nobody knows which of the two failed;
-    `disputes`: times about reads that exclude the reference; `true_clocks_s`: by how much the odometer's stamps may be
-    early.
+    of unknown origin parts from an independent one; `doubted`: steps and drifts of the reference that an odometer or a
+    read contradicts, and clocks that change; `unsure`: times in which nobody knows which of the two failed; `disputes`:
+    times about reads that exclude the reference; `true_clocks_s`: by how much the odometer's stamps may be early.
     """
 
     stretches: tuple[KnownStretch, ...]
-    silent: tuple[Span, ...]
+    off_track: tuple[Span, ...]
     carried: tuple[Carried, ...]
     by_reads: tuple[Carried, ...]
     reads_ns: Ints
@@ -118,9 +117,9 @@ class TrainEvidence:
 
     @property
     def contradicted(self) -> int:
-        """Gaps between anchors whose length by the odometer, scaled by the vehicle file, fits no way on the track."""
+        """Gaps between anchors whose length by the odometer, scaled by the vehicle file, fits no route on the track."""
         by_file = bool(self.carried) and self.carried[0].counter.by_file
-        return sum(bool(gap.ways) and len(gap.anchors) == 2 and not gap.closed for gap in self.gaps if by_file)
+        return sum(bool(gap.routes) and len(gap.anchors) == 2 and not gap.closed for gap in self.gaps if by_file)
 
     @property
     def unreachable(self) -> int:
@@ -169,6 +168,12 @@ class TrainEvidence:
 
         Nothing is carried from one side over a stand of the odometer (`stood`). Up to a second after a recording that
         ended in a stand the train is taken to stand on.
+
+        Args:
+            t_ns: instants in any order [ns], shape (n,).
+
+        Returns:
+            Net elements and intervals at each of them.
         """
         return either([self._by_clock(t_ns, early_s) for early_s in self.true_clocks_s])
 
@@ -187,7 +192,7 @@ class TrainEvidence:
         kind = np.full(t_ns.size, NOTHING)
         proves, on_survey = np.zeros((2, t_ns.size), dtype=np.bool_)
         shown = _Shown(kind, proves, on_survey)
-        on_track = ~within_spans(t_ns, self.silent)
+        on_track = ~within_spans(t_ns, self.off_track)
         heard = on_track & ~within_spans(t_ns, self.unsure)
         alternatives = self._covered(instants, heard, shown)
         alternatives += self._carried(self.carried, instants, heard & (kind == NOTHING), shown)
@@ -233,8 +238,8 @@ class TrainEvidence:
     ) -> list[Alternative]:
         """By each odometer, from the anchors of its gaps: the train was where one of them says.
 
-        Writes into `shown`. Between two anchors of one surveyed way that the odometer closes the train was on that way;
-        a read itself needs no odometer.
+        Writes into `shown`. Between two anchors of one surveyed route that the odometer closes the train was on that
+        route; a read itself needs no odometer.
         """
         t_ns = instants.t_ns
         alternatives: list[Alternative] = []
@@ -245,9 +250,9 @@ class TrainEvidence:
                 rows = rows[open_rows[rows]]
                 if len(gap.anchors) == 1:
                     rows = rows[~_after_standing(instants.t_ns[rows], gap, self.stood)]
-                for way in gap.ways or [] if rows.size else []:
-                    low_m, high_m = self._interval(source.counter, gap, way, t_ns[rows])
-                    there = Alternative(rows, way.chain.route(self.network), low_m, high_m).where(np.isfinite(low_m))
+                for route in gap.routes or [] if rows.size else []:
+                    low_m, high_m = self._interval(source.counter, gap, route, t_ns[rows])
+                    there = Alternative(rows, route.chain.route(self.network), low_m, high_m).where(np.isfinite(low_m))
                     alternatives.append(there)
                     open_rows[there.rows] = False
                     by_read = any(anchor.kind is Kind.BALISE for anchor in gap.anchors)
@@ -257,10 +262,11 @@ class TrainEvidence:
                     shown.on_survey[there.rows] = gap.on_survey(self.network) | at_anchor
         return alternatives
 
-    def _interval(self, counter: Counter, gap: Gap, way: GapChain, t_ns: Ints) -> Interval:
+    def _interval(self, counter: SignedOdometer, gap: Gap, route: GapChain, t_ns: Ints) -> Interval:
+        """Coordinates on a route through a gap, by both of its anchors or the only one."""
         if gap.begin is not None and gap.end is not None:
-            return between_anchors(counter, (gap.begin, gap.end), (way.at_m[0], way.at_m[1]), t_ns, self.config)
-        return carried(counter, gap.anchors[0], way.at_m[0], t_ns, self.config)
+            return between_anchors(counter, (gap.begin, gap.end), (route.at_m[0], route.at_m[1]), t_ns, self.config)
+        return carried(counter, gap.anchors[0], route.at_m[0], t_ns, self.config)
 
 
 def _on_path(stretch: KnownStretch, path: KnownPath, rows: Ints, t_ns: Ints, factor: float) -> list[Alternative]:
@@ -333,6 +339,7 @@ def _overlapping(
 
 
 def _spoken(alternatives: Sequence[Alternative], size: int) -> Bools:
+    """Instants at which there is an alternative."""
     spoken = np.zeros(size, dtype=np.bool_)
     for alternative in alternatives:
         spoken[alternative.rows] = True
@@ -359,9 +366,15 @@ def _narrowed(first: Alternative, second: Alternative) -> Alternative:
 
 
 def either(sets: Sequence[EvidenceSet]) -> EvidenceSet:
-    """One of several sets holds, nobody knows which: every alternative stays possible, and proved is what all prove.
+    """The union of several sets of which one holds, nobody knows which; proved is what all prove.
 
-    Where one is silent, so are all: it could have said anything.
+    Where one says nothing, so do all: it could have said anything.
+
+    Args:
+        sets: evidence at the same n instants, at least one.
+
+    Returns:
+        Evidence at these instants.
     """
     if len(sets) == 1:
         return sets[0]
@@ -407,7 +420,7 @@ def within_spans(t_ns: Ints, spans: Sequence[Span]) -> Bools:
 
 
 def _after_standing(t_ns: Ints, gap: Gap, stood: Sequence[Span]) -> Bools:
-    """Instants to which nothing can be carried, because the odometer stood on the way from the anchor."""
+    """Instants to which nothing can be carried, because the odometer stood still since the anchor."""
     void = np.zeros(t_ns.size, dtype=np.bool_)
     for begin_ns, end_ns in stood:
         if gap.begin is not None and end_ns > gap.begin_ns:

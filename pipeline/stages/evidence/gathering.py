@@ -16,14 +16,14 @@ from pipeline.stages.evidence.anchors import (
     on_clock,
     outside,
     read_anchors,
-    reference_ways,
+    reference_movements,
     shown_on_its_track,
     sided,
 )
 from pipeline.stages.evidence.carrying import (
-    Counter,
     Lags,
     RecorderClock,
+    SignedOdometer,
     TrueAnchor,
     clocks_of,
     lags_of,
@@ -64,7 +64,8 @@ def without_frozen(
     """The reference without samples that repeat the one before while an odometer moves on: any, or any independent one.
 
     A recorder that stands still says nothing of where the train is (DOMAIN section 5.0): after so long the stretch
-    ends. A train that stands repeats too: there the odometer shows no way beyond its dead band and the sample's noise.
+    ends. A train that stands repeats too: there the odometer shows no movement beyond its dead band and the sample's
+    noise.
     """
     witnesses = [odometer for odometer in odometers if odometer.independent] or list(odometers)
     if reference is None or reference.height < 2 or not witnesses:
@@ -117,8 +118,8 @@ def known_stretch(
         reads_ns = _confirming_ns(known, stretch, clock_m, reads, config.hazards.evidence_factor, most_m)
         steps = contradictions(known, side.stretch, witnesses, config)
         of_path = Levels.of(steps, t_ns, reads_ns)
-        levels.append(of_path.seen(side.sense))
-        opened = left_open(known, t_ns, steps, of_path, beyond.seen(side.sense))
+        levels.append(of_path.oriented(side.sense))
+        opened = left_open(known, t_ns, steps, of_path, beyond.oriented(side.sense))
         paths.append(opened)
         possible_ns |= set(_confirming_ns(opened, stretch, clock_m, reads, config.align.sure_sigmas, np.inf))
     disputed = _disputed(t_ns, reads, possible_ns)
@@ -182,9 +183,9 @@ def _confirming_ns(
             continue
         at_m = np.interp([float(read.t_ns - t_ns[0])], since_ns, known.at_m)
         sample = int(np.searchsorted(t_ns, read.t_ns))
-        beside = slice(max(sample - 1, 0), sample + 1)
-        low_m = float(at_m[0] + (known.low_m - known.at_m)[beside].min())
-        high_m = float(at_m[0] + (known.high_m - known.at_m)[beside].max())
+        around = slice(max(sample - 1, 0), sample + 1)
+        low_m = float(at_m[0] + (known.low_m - known.at_m)[around].min())
+        high_m = float(at_m[0] + (known.high_m - known.at_m)[around].max())
         route = known.path.legs[int(known.path.leg[sample])]
         half_m = factor * float(np.hypot(stretch.sigma_m[sample], read.sigma_m))
         half_m += float(clock_m[sample]) + read.clock_m
@@ -195,7 +196,7 @@ def _confirming_ns(
     return sorted(confirming)
 
 
-# Numerics: ways over which two odometers are compared [s].
+# Numerics: movements over which two odometers are compared [s].
 _PARTED_S = 60.0
 
 
@@ -210,20 +211,35 @@ def evidence_of(
 ) -> TrainEvidence:
     """Everything that is known of where the train was, except from GNSS.
 
-    `reference`: as from `reference_stretches`; `odometers`: that of the LDS first. Where any is independent, the others
-    confirm nothing and narrow nothing; where none is, what they carry proves nothing.
+    Where any odometer is independent, the others confirm nothing and narrow nothing; where none is, what they carry
+    proves nothing.
+
+    Args:
+        reference: stretches of the reference and spans off the track [ns], as from `reference_stretches`.
+        reads: telegrams received (`t`, `balise_id`), or None.
+        balises: balises of the site, or None.
+        odometers: all odometers, that of the LDS first.
+        network: the track network, its elements not in pieces.
+        vehicle: the place of the GNSS antenna [m].
+        config: the configuration; used are `hazards`, `evidence`, `align`, `lds` and `matching`.
+
+    Returns:
+        The evidence, which is asked for any instants.
+
+    Source:
+        DOMAIN sections 5.0 and 5.1.
     """
     hazards = config.hazards
     independent = [odometer for odometer in odometers if odometer.independent]
-    counters = [Counter(odometer, config.hazards.limits.doubt_m) for odometer in independent or odometers]
+    counters = [SignedOdometer(odometer, config.hazards.limits.doubt_m) for odometer in independent or odometers]
     main = counters[0] if counters else None
     least_m = config.matching.orientation_distance_m
-    stretches, silent = reference
+    stretches, off_track = reference
     sides = [sided(stretch, main, least_m) for stretch in stretches]
-    facing = frozenset(side.facing for side in sides if abs(side.with_m - side.against_m) >= least_m)
+    oriented = frozenset(side.first_oriented for side in sides if abs(side.with_m - side.against_m) >= least_m)
     if any(min(side.with_m, side.against_m) >= least_m for side in sides):
         counters = [counter.without_sign() for counter in counters]
-    searches = [GapSearch(counter, network, config, facing) for counter in counters]
+    searches = [GapSearch(counter, network, config, oriented) for counter in counters]
     lags = [_lags_of_reference(stretches, search, least_m) for search in searches]
     # Any odometer contradicts a reference; where one is independent, the others are not asked.
     found = [Witness.of(*of_one, config) for of_one in zip(counters, lags, strict=True)]
@@ -238,7 +254,7 @@ def evidence_of(
     shift_ns = round(of_reference.shift_s * NS_PER_S)
     return TrainEvidence(
         stretches=known,
-        silent=tuple((begin_ns - shift_ns, end_ns - shift_ns) for begin_ns, end_ns in silent),
+        off_track=tuple((begin_ns - shift_ns, end_ns - shift_ns) for begin_ns, end_ns in off_track),
         carried=tuple(search.carried(_borders(known, search.counter, apart)) for search in searches),
         by_reads=tuple(search.carried(_points(clocked)) for search in searches) if recorded else (),
         reads_ns=np.array([anchor.t_ns for anchor in clocked], dtype=np.int64),
@@ -286,40 +302,42 @@ def _known_stretches(
 
 
 def _borders(
-    stretches: Sequence[KnownStretch], counter: Counter, reads: Sequence[TrueAnchor]
+    stretches: Sequence[KnownStretch], counter: SignedOdometer, reads: Sequence[TrueAnchor]
 ) -> list[tuple[TrueAnchor, TrueAnchor]]:
+    """First and last anchor of each stretch and of each read: between them nothing has to be carried."""
     return [*(stretch.ends(counter) for stretch in stretches), *_points(reads)]
 
 
 def _points(known: Sequence[TrueAnchor]) -> list[tuple[TrueAnchor, TrueAnchor]]:
+    """Anchors that last for an instant: first and last anchor are the same."""
     return [(anchor, anchor) for anchor in known]
 
 
 def _lags_of_reference(stretches: Sequence[ReferenceStretch], search: GapSearch, least_m: float) -> Lags:
     """Its clock against that of one odometer, in the sense in which that one counts.
 
-    One that counts up both ways is compared where the train cannot have turned.
+    One that counts up in both directions is compared where the train cannot have turned.
     """
     sides = [sided(stretch, search.counter, least_m) for stretch in stretches]
-    begin_ns, end_ns, way_m, sigma_m = reference_ways(sides, search.only_length_m)
-    way_m = way_m if search.counter.signed else np.abs(way_m)
-    return lags_of(begin_ns, end_ns, way_m, sigma_m, search.counter, search.config)
+    begin_ns, end_ns, moved_m, sigma_m = reference_movements(sides, search.only_length_m)
+    moved_m = moved_m if search.counter.signed else np.abs(moved_m)
+    return lags_of(begin_ns, end_ns, moved_m, sigma_m, search.counter, search.config)
 
 
 def _lags_of_reads(source: Carried, config: Configuration) -> Lags:
-    """The clock of the reads against an odometer's, by the ways between reads, whether they close or not."""
-    ways = [
+    """The clock of the reads against an odometer's, by the distances between reads, whether they close or not."""
+    movements = [
         (gap.begin_ns, gap.end_ns, apart_m, float(np.linalg.norm([anchor.sigma_m for anchor in gap.anchors])))
         for gap in source.gaps
         for apart_m in gap.only_length_m
     ]
-    begins, ends, *lengths = zip(*ways, strict=True) if ways else ((), (), (), ())
-    way_m, sigma_m = (np.array(values, np.float64) for values in lengths)
-    return lags_of(np.array(begins, np.int64), np.array(ends, np.int64), way_m, sigma_m, source.counter, config)
+    begins, ends, *lengths = zip(*movements, strict=True) if movements else ((), (), (), ())
+    moved_m, sigma_m = (np.array(values, np.float64) for values in lengths)
+    return lags_of(np.array(begins, np.int64), np.array(ends, np.int64), moved_m, sigma_m, source.counter, config)
 
 
 def _parted(odometers: Sequence[Odometry], config: Configuration) -> bool:
-    """An odometer of unknown origin counts otherwise than an independent one, by more than 5 m + 5 % of a way."""
+    """An odometer of unknown origin counts otherwise than an independent one, by more than 5 m + 5 % of a distance."""
     independent = [odometer for odometer in odometers if odometer.independent]
     others = [odometer for odometer in odometers if odometer.origin is Origin.UNKNOWN and not odometer.follows_gnss]
     for other in others:
@@ -327,17 +345,23 @@ def _parted(odometers: Sequence[Odometry], config: Configuration) -> bool:
             begin_ns = max(other.begin_ns, witness.begin_ns)
             end_ns = min(other.end_ns, witness.end_ns)
             at_ns = np.arange(begin_ns, end_ns, round(_PARTED_S * NS_PER_S), dtype=np.int64)
-            ways = [np.abs(odometer.steps_m(at_ns)) for odometer in (other, witness)]
-            allowed_m = config.lds.odometer_fixed_m + config.lds.odometer_share * ways[1]
-            if (np.abs(ways[0] - ways[1]) > allowed_m).any():
+            moved_m = [np.abs(odometer.steps_m(at_ns)) for odometer in (other, witness)]
+            allowed_m = config.lds.odometer_fixed_m + config.lds.odometer_share * moved_m[1]
+            if (np.abs(moved_m[0] - moved_m[1]) > allowed_m).any():
                 return True
     return False
 
 
 def true_places(evidence: EvidenceSet, track: SurveyedTrack) -> pl.DataFrame:
-    """Per instant `true_netelement_ids`, in the order of the survey, `true_measure_low_m` and `true_measure_high_m`.
+    """The evidence as columns of `epochs`.
 
-    Null where nothing is known; the measures also where there are several net elements.
+    Args:
+        evidence: where the train was, at n instants.
+        track: the survey, whose elements the evidence numbers.
+
+    Returns:
+        `true_netelement_ids`, in the order of the survey, `true_measure_low_m` and `true_measure_high_m` [m], n rows.
+        Null where nothing is known; the measures also where there are several net elements.
     """
     parts = [_touched(alternative) for alternative in evidence.alternatives]
     touched = pl.concat([pl.DataFrame(schema=_TOUCHED), *parts])

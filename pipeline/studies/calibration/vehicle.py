@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from pipeline.stages.evidence.carrying import Counter
+from pipeline.stages.evidence.carrying import SignedOdometer
 from pipeline.stages.odometry import Odometry
 from pipeline.stages.odometry.scale_lag import scale_and_lag, spans_of_rows
 from schemas.arrays import Floats
@@ -32,7 +32,7 @@ def estimate_run(t_s: Floats, path_m: Floats, odometry: Odometry) -> RunEstimate
     `odometry` grows with the path.
     """
     begin, end = spans_of_rows(t_s)
-    found = scale_and_lag(t_s[begin], t_s[end], path_m[end] - path_m[begin], Counter(odometry).rows)
+    found = scale_and_lag(t_s[begin], t_s[end], path_m[end] - path_m[begin], SignedOdometer(odometry).rows)
     if not np.isfinite(found.scale_sigma):
         return None
     return RunEstimate(
