@@ -41,7 +41,14 @@ def _level_columns(level: str) -> dict[str, dy.Column]:
 
 
 def campaign_runs_schema(levels: Iterable[str]) -> type[dy.Schema]:
-    """Contract of `campaign/runs.parquet`; the service levels are those of the configuration."""
+    """Contract of `campaign/runs.parquet`; the service levels are those of the configuration.
+
+    Args:
+        levels: names of the service levels.
+
+    Returns:
+        The schema, with the rates and verdict of each level.
+    """
     return _campaign_runs_schema(tuple(levels))
 
 

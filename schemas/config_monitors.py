@@ -11,7 +11,17 @@ from schemas.tables import MONITORS
 
 
 def threshold_factor(false_alarm_probability: float) -> float:
-    """k_T: two-sided Gaussian quantile of the false-alarm probability (DIAG eq. 17); 5.3267 for 1e-7."""
+    """k_T: the Gaussian quantile of the false-alarm probability; 5.3267 for 1e-7.
+
+    Args:
+        false_alarm_probability: per sample, two-sided [1].
+
+    Returns:
+        k_T in standard deviations [1].
+
+    Source:
+        DIAG eq. 17.
+    """
     from scipy.special import ndtri  # most commands that read a configuration test nothing
 
     return float(-ndtri(false_alarm_probability / 2.0))

@@ -45,7 +45,17 @@ def groups() -> dict[str, Mapping[str, type[dy.Schema]]]:
 
 
 def dictionary_frame(only: str | None = None) -> pl.DataFrame:
-    """One row per column, of all tables or `only` one: `group, table, column, dtype, unit, nullable, meaning`."""
+    """Every column of every table, or of one: one row per column.
+
+    Args:
+        only: name of a table, or None for all.
+
+    Returns:
+        `group, table, column, dtype, unit, nullable, meaning`.
+
+    Raises:
+        UsageError: there is no table of that name.
+    """
     known = [table for tables in groups().values() for table in tables]
     if only is not None and only not in known:
         raise UsageError("is not a table", place=only, expected=", ".join(known))

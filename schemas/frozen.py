@@ -21,9 +21,14 @@ def frozen(cls: Class, /) -> Class: ...
 def frozen(*, eq: bool = True) -> Callable[[Class], Class]: ...
 @dataclass_transform(frozen_default=True, field_specifiers=(field,))
 def frozen(cls: Any = None, /, *, eq: bool = True) -> Any:
-    """As `dataclass(frozen=True, eq=eq)`: arguments by place or name, and values that never change.
+    """Make a class of named values that never change, as `dataclass(frozen=True, eq=eq)`.
 
-    Equal and hashed by value; without `eq` one is only equal to itself.
+    Args:
+        cls: the class, where the decorator is used without arguments.
+        eq: compare and hash by value; else an object is only equal to itself.
+
+    Returns:
+        The class, or a decorator for it.
     """
     return (lambda named: _made(named, eq)) if cls is None else _made(cls, eq)
 

@@ -33,7 +33,14 @@ _SOURCE_WORDS = pl.Series([*SIGMA_SOURCES, None], dtype=pl.Enum(SIGMA_SOURCES))
 
 
 def reason_words(reason: Ints) -> pl.Series:
-    """Numbers in `REASONS` as words, null for `NO_REASON`; shape (epochs,)."""
+    """Numbers of reasons as words, null for `NO_REASON`.
+
+    Args:
+        reason: numbers in `REASONS`, shape (n,).
+
+    Returns:
+        Words of n rows.
+    """
     return _gathered(_REASON_WORDS, reason)
 
 

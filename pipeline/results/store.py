@@ -88,7 +88,22 @@ def read_run(out: Address, run_id: str) -> RunTables:
 
 
 def read_table(out: Address, table: str, run_id: str | None = None) -> pl.LazyFrame:
-    """One table of all complete runs, or of one, with the column `run_id` in front."""
+    """One table of a result, with the column `run_id` in front.
+
+    Args:
+        out: the result of a campaign.
+        table: name of the table: `hazards`, `passages`, `alarms`, `epochs` or `runs`.
+        run_id: one run; None for all complete ones.
+
+    Returns:
+        The rows, read where they are collected.
+
+    Raises:
+        UsageError: there is no such table or run.
+
+    Source:
+        CONTRACT section 3.
+    """
     if table not in TABLES:
         raise UsageError("is not a table", place=table, expected=", ".join(TABLES))
     runs = run_ids(out) if run_id is None else [run_id]

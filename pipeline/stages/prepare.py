@@ -104,7 +104,21 @@ class PreparedRun:
 def prepare(
     run: RunLog, site: Site, vehicle: Vehicle, config: Configuration, clock_advice: ClockAdvice = no_advice
 ) -> PreparedRun:
-    """`clock_advice` helps where the recorders' times do not meet."""
+    """Put the streams of a run in order, make its odometers, and test whether they are made of the positions.
+
+    Args:
+        run: the run as recorded.
+        site: track, links, balises and route.
+        vehicle: what is known of the vehicle.
+        config: the configuration.
+        clock_advice: what would move recorders of different times to one journey, for the error's remedy.
+
+    Returns:
+        The run in order, with its odometers; solutions are matched when asked for.
+
+    Raises:
+        InputError: nothing can be replayed: no two times, none in common, longer than a journey.
+    """
     recorded, counts = clean(run, config, clock_advice)
     journey = of_the_journey(recorded)
     sensors = () if journey.odometer is None else (journey.odometer, *journey.other_odometers)

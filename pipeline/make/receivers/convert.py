@@ -54,7 +54,19 @@ class Converted:
 
 
 def convert(logs: list[Path], run_id: str, config: IngestConfig | None = None) -> Converted:
-    """Receiver logs of one journey as one new run: `gather` and `as_run`."""
+    """Receiver logs of one journey as one new run: `gather` and `as_run`.
+
+    Args:
+        logs: files of one journey.
+        run_id: id of the run.
+        config: the section `ingest` of the configuration; None: the defaults.
+
+    Returns:
+        The run, and what was left out.
+
+    Raises:
+        InputError: no log holds an epoch.
+    """
     return as_run(gather(logs, config), run_id)
 
 
@@ -65,7 +77,21 @@ def as_run(
     sigmas: FixSigma | None = None,
     correct: Sequence[StreamCorrection] = (),
 ) -> Converted:
-    """A new run of what logs hold, positions as `purpose` says, corrected; raises `InputError` without positions."""
+    """Make a new run of what logs hold.
+
+    Args:
+        logs: what the logs hold, as `gather` yields it.
+        run_id: id of the run.
+        purpose: which stream the positions become; None: `gnss`.
+        sigmas: standard deviations by kind of fix, where a log states none [m].
+        correct: corrections of streams.
+
+    Returns:
+        The run, and what was left out.
+
+    Raises:
+        InputError: the logs hold no position.
+    """
     streams = assigned(logs.streams, purpose or Purpose(), sigmas or FixSigma())
     if "gnss" not in streams:
         raise InputError(
@@ -90,7 +116,23 @@ def extended(
     force: bool,
     correct: Sequence[StreamCorrection] = (),
 ) -> Converted:
-    """A run that stands at a place, with what logs hold added to it; both are corrected first."""
+    """Add what logs hold to a run; both are corrected first.
+
+    Args:
+        run: the run as it stands.
+        place: its path, for errors.
+        logs: what the logs hold, as `gather` yields it.
+        purpose: which stream the positions become.
+        sigmas: standard deviations by kind of fix, where a log states none [m].
+        force: replace streams that the run has already.
+        correct: corrections of streams.
+
+    Returns:
+        The run with the streams added, and what was left out.
+
+    Raises:
+        InputError: the run has a stream already, or its corrections differ.
+    """
     streams = assigned(logs.streams, purpose, sigmas)
     notes = IngestNotes(corrections=logs.corrections_as(purpose))
     bare = RunLog(run.run_id, run.gnss.clear(), notes=notes).with_streams(**streams)
@@ -151,11 +193,19 @@ def gathered_of(run: RunLog, dropped: Mapping[str, int]) -> Gatherings:
 def gather(
     logs: list[Path], config: IngestConfig | None = None, date: date | None = None, solution: str | None = None
 ) -> Gatherings:
-    """What the logs hold: positions, or whatever else a mapping or a topic makes a stream of.
+    """Read what the logs hold.
 
-    `date`: the day of the first sentence, for NMEA logs that hold none. `solution`: the talker or device that is meant,
-    where a log holds the positions of two receivers. Raises `InputError` where no log of a receiver
-    holds an epoch, or where two logs tell of the same time under one solution.
+    Args:
+        logs: files, packed or not.
+        config: the section `ingest` of the configuration; None: the defaults.
+        date: the day of the first sentence, for NMEA logs that hold none.
+        solution: the talker or device that is meant, where a log holds the positions of two receivers.
+
+    Returns:
+        Streams of positions, or whatever else a mapping or a topic makes a stream of, and what was left out.
+
+    Raises:
+        InputError: no log of a receiver holds an epoch, or two logs hold the same time under one solution.
     """
     dropped: Counter[str] = Counter()
     parts: list[tuple[Path, Gatherings]] = []
@@ -220,7 +270,14 @@ class UnknownError(InputError):
 
 
 def said_of(reason: str) -> str:
-    """What became of the records of a reason: some are told and used all the same."""
+    """What became of the records set apart for a reason: some are noted and used all the same.
+
+    Args:
+        reason: why records were set apart.
+
+    Returns:
+        `noted` or `not used`.
+    """
     return "noted" if re.search(r"\((kept|put right)", reason) else "not used"
 
 

@@ -34,16 +34,26 @@ _DEFAULTS = SiteConfig()
 
 
 def read_site(path: Path | str, config: SiteConfig = _DEFAULTS) -> Site:
-    """The site of a folder (CONTRACT section 2) or of one GeoJSON file with track and links, positions in WGS 84.
+    """Read the site of a folder or of one GeoJSON file with track and links, positions in WGS 84.
 
-    `track` is Parquet, CSV or RailTopoModel GeoJSON; each file may name its EPSG code: Parquet in its
-    key-value metadata (`epsg`), CSV in a comment line (`# epsg: 31370`), both in a column `epsg`, GeoJSON
-    in its `crs` member. In a projected system `longitude_deg` holds the easting and `latitude_deg` the
-    northing, or the columns are named `x_m` and `y_m`. Heights are taken as they are (ellipsoidal).
-    `measure_m` empty for a whole element: its geometric length. A route's `direction` is AB, growing or
-    forward (from the element's start to its end), or BA, falling or reverse.
+    `track` is Parquet, CSV or RailTopoModel GeoJSON; each file may name its EPSG code: Parquet in its key-value
+    metadata (`epsg`), CSV in a comment line (`# epsg: 31370`), both in a column `epsg`, GeoJSON in its `crs` member. In
+    a projected system `longitude_deg` holds the easting and `latitude_deg` the northing, or the columns are named `x_m`
+    and `y_m`. Heights are taken as they are (ellipsoidal). `measure_m` empty for a whole element: its geometric length.
+    A route's `direction` is AB, growing or forward (from the element's start to its end), or BA, falling or reverse.
 
-    Raises `SiteError` with all breaches at once; what is merely remarkable is in `Site.findings`.
+    Args:
+        path: the folder, or the GeoJSON file; local or `s3://`-style.
+        config: the section `site` of the configuration: limits of its checks [m].
+
+    Returns:
+        Track, links, balises and route; what is merely remarkable is in `Site.findings`.
+
+    Raises:
+        SiteError: the site breaches the contract; all breaches at once.
+
+    Source:
+        CONTRACT section 2.
     """
     files = _files(path)
     breaches: list[str] = []

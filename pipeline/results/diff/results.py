@@ -127,9 +127,17 @@ class ResultDiff:
 
 
 def diff_results(out_a: Address, out_b: Address, rules: Rules = NO_RULES) -> ResultDiff:
-    """Compare two results run by run; files of the same bytes are not opened. `rules`: what may differ.
+    """Compare two results run by run; files of the same bytes are not opened.
 
     Hazards of the same solution and class at most `HAZARD_WINDOW_S` apart are the same hazard.
+
+    Args:
+        out_a: the first result.
+        out_b: the second one.
+        rules: what may differ.
+
+    Returns:
+        Runs that only one of them has, and the differences of the others.
     """
     runs_a, runs_b = (store.complete_runs(out) for out in (out_a, out_b))
     common = [run for run in runs_a if run in set(runs_b)]

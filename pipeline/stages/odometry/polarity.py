@@ -20,6 +20,15 @@ def counted_over_slip(
 
     Slip stays reported, but only `other_way_share` of the step is in doubt. Others may count with the other sign, as
     the first `orientation_m` show.
+
+    Args:
+        odometry: the odometer of the LDS.
+        others: the other independent odometers, in order of preference.
+        orientation_m: distance over which the sign of another one is found [m].
+        config: the section `align` of the configuration.
+
+    Returns:
+        The odometer, with the distances over slip replaced.
     """
     if not others or not odometry.slip.any():
         return odometry

@@ -47,7 +47,21 @@ def claim(
     areas: pl.DataFrame | None = None,
     ahead_m: float = 0.0,
 ) -> Claim:
-    """Hold all complete runs of a result against a profile; `ahead_m`: front end ahead of the balise antenna."""
+    """Hold all complete runs of a result against a profile of requirements.
+
+    Args:
+        out: the result of a campaign.
+        profile: the requirements.
+        site: the site of the result, where requirements ask for places.
+        areas: kinds of area along the site, as `read_areas` yields them.
+        ahead_m: front end ahead of the balise antenna [m].
+
+    Returns:
+        What was found of each requirement, and on what it rests.
+
+    Raises:
+        UsageError: the result is of another site.
+    """
     run_ids = store.complete_runs(out)
     config = store.read_config(out) or Configuration()
     for run_id, metadata in store.completed_runs(out).items():
@@ -190,7 +204,14 @@ def _notes(
 
 
 def for_reading(claim: Claim) -> pl.DataFrame:
-    """The rows as they fit a screen: what was found of each requirement, and what it rests on."""
+    """The rows as they fit a screen: what was found of each requirement, and what it rests on.
+
+    Args:
+        claim: what was found.
+
+    Returns:
+        One row per requirement and solution.
+    """
     by_runs = {
         requirement.key
         for requirement in requirements(claim.profile)

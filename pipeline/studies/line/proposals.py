@@ -75,7 +75,15 @@ def proposals(line: LineEvidence) -> tuple[pl.DataFrame, pl.DataFrame]:
 
 
 def site_balises(balises: pl.DataFrame, criteria: LineCriteria) -> pl.DataFrame:
-    """A proposal as the `balises` table of a site."""
+    """A proposal as the `balises` table of a site.
+
+    Args:
+        balises: a proposal.
+        criteria: location accuracy of its balises [m].
+
+    Returns:
+        Rows of `balises.parquet` (CONTRACT section 2).
+    """
     return balises.select(
         "balise_id",
         "netelement_id",

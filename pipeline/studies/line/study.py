@@ -49,9 +49,20 @@ class LineResult:
 def study_line(
     out: Path, site: Site, criteria: LineCriteria, solution: str | None = None, points: pl.DataFrame | None = None
 ) -> LineResult:
-    """Classes and proposals from all complete runs of `out`.
+    """Classify pieces of track by all complete runs of a result, and propose balises.
 
-    `points`: stations and signals (`name, netelement_id, measure_m`). Raises `UsageError` for results of another site.
+    Args:
+        out: the result of a campaign.
+        site: its site.
+        criteria: lengths [m], shares and counts by which pieces of track are classified.
+        solution: one solution; None for all.
+        points: stations and signals (`name, netelement_id, measure_m` [m]), near which balises are wanted.
+
+    Returns:
+        Classes of all pieces of track, proposals of balises, and remarks.
+
+    Raises:
+        UsageError: the result is of another site.
     """
     runs, twice = distinct(_runs(out, site, solution))
     pieces = pieces_of(site, criteria.piece_m)
@@ -65,7 +76,17 @@ def study_line(
 
 
 def read_points(path: Path) -> pl.DataFrame:
-    """Stations and signals from a CSV with `name, netelement_id, measure_m`."""
+    """Read stations and signals.
+
+    Args:
+        path: a CSV file with `name, netelement_id, measure_m`.
+
+    Returns:
+        One row per point; measures [m].
+
+    Raises:
+        InputError: the file cannot be read.
+    """
     try:
         frame = pl.read_csv(path, infer_schema=False)
         return frame.select(pl.col(name).cast(dtype) for name, dtype in POINT_COLUMNS.items()).drop_nulls()
