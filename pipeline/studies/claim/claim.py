@@ -114,6 +114,7 @@ def _name(run: dict[str, Any]) -> str:
 
 
 def _add(sums: Tallies, more: Tallies) -> None:
+    """Add counts to the sums, in place."""
     for key, counts in more.items():
         sums[key] = sums.get(key, Tally()) + counts
 

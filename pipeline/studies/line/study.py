@@ -126,7 +126,7 @@ def passes_of_runs(
         passes = passes_of(epochs, passages, alarms, ground, criteria, config)
         if evidence != Evidence.REFERENCE.value:
             # Reads and odometers tell by where they are, not by how good positions are: what they miss hides nothing.
-            passes = passes.with_columns(pl.col("state").replace(int(SpanState.UNKNOWN), int(SpanState.UNSEEN)))
+            passes = passes.with_columns(pl.col("state").replace(int(SpanState.UNKNOWN), int(SpanState.NOT_COVERED)))
         parts.append(passes.with_columns(run_id=pl.lit(run)))
         errors.append(_undetected(passages, ground.pieces))
     return pl.concat(parts), pl.concat(errors).group_by("piece").agg(pl.col("largest_undetected_m").max())

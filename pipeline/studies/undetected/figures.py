@@ -9,13 +9,14 @@ from schemas.frozen import frozen
 
 @frozen
 class Spacing:
-    """The shortest way and time from a physical balise, wherever it is thought to be, to an error beyond the limit.
+    """The shortest distance and time from a physical balise, wherever it is thought to be, to an error beyond the
+    limit.
 
     None where no start reaches the limit before the run ends. `starts`: balises thought of; `reached`: how many of them
     reach it.
     """
 
-    way_m: float | None = None
+    distance_m: float | None = None
     time_s: float | None = None
     starts: int = 0
     reached: int = 0
@@ -28,7 +29,7 @@ def undetected_figures(epochs: pl.DataFrame, spacing: Spacing | None, limit_m: f
     larger = pl.max_horizontal("undetected_ahead_m", "undetected_behind_m")
     known = epochs.filter("in_use").select("t", "path_m", larger=larger).drop_nulls("larger")
     figures: dict[str, object] = {
-        "physical_spacing_m": spacing.way_m,
+        "physical_spacing_m": spacing.distance_m,
         "physical_spacing_s": spacing.time_s,
         "physical_spacing_starts": spacing.starts,
         "physical_spacing_reached": spacing.reached,

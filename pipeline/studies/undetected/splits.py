@@ -56,7 +56,7 @@ def best_shares(stretch: GrowthStretch) -> Floats:
     from scipy.optimize import linprog
 
     blocks = _Blocks.over(stretch.rows)
-    monitors = 1 + stretch.seen.weight.shape[1]
+    monitors = 1 + stretch.watched.weight.shape[1]
     ends = 2 * blocks.first.size
     parts = [_raw(stretch, blocks), *(_average(stretch, blocks, average) for average in range(monitors - 1))]
     costs = np.concatenate([part.cost for part in parts])
@@ -89,19 +89,19 @@ class _MonitorCost(NamedTuple):
 
 
 def _raw(stretch: GrowthStretch, blocks: _Blocks) -> _MonitorCost:
-    raw_mps = np.maximum(np.abs(stretch.seen.most_mps), np.abs(stretch.seen.least_mps))
-    raw_m = np.add.reduceat(stretch.seen.way_s * _tested(raw_mps), blocks.first)
+    raw_mps = np.maximum(np.abs(stretch.watched.most_mps), np.abs(stretch.watched.least_mps))
+    raw_m = np.add.reduceat(stretch.watched.gain_s * _tested(raw_mps), blocks.first)
     single = blocks.first == blocks.last
     cost = np.column_stack([np.where(single, raw_m, 0.5 * raw_m), np.where(single, 0.0, 0.5 * raw_m)]).ravel()
     return _MonitorCost(np.eye(cost.size), cost, np.zeros(cost.size))
 
 
 def _average(stretch: GrowthStretch, blocks: _Blocks, average: int) -> _MonitorCost:
-    weight = stretch.seen.weight[:, average]
-    part = stretch.seen.way_s / weight
+    weight = stretch.watched.weight[:, average]
+    part = stretch.watched.gain_s / weight
     # What a row gives to the average, its row before has to pay for in part; the last row has none after it.
     after = np.append((part * (1.0 - weight))[1:], 0.0)
-    at, cost = _paid_at(blocks, _tested(stretch.seen.threshold_mps[:, average]))
+    at, cost = _paid_at(blocks, _tested(stretch.watched.threshold_mps[:, average]))
     following = np.minimum(at + 1, stretch.rows - 1)
     terms = part[at, None] * blocks.lines(at) - after[at, None] * blocks.lines(following)
     start = np.eye(1, terms.shape[1]) * part[0] * (1.0 - weight[0])
@@ -152,7 +152,7 @@ def growth_with(stretch: GrowthStretch, splits: Iterable[Floats]) -> Growth:
     A split shares the fault out among the monitors: any bounds the growth, also one for the first rows only.
     """
     most = np.full(stretch.rows, np.inf)
-    monitors = 1 + stretch.seen.weight.shape[1]
+    monitors = 1 + stretch.watched.weight.shape[1]
     paid = np.zeros((stretch.rows, monitors))
     to_one_monitor = (np.tile(alone, (stretch.rows, 1)) for alone in np.eye(monitors))
     for shares in (*to_one_monitor, *splits):
