@@ -76,10 +76,12 @@ def misfit(
 
 
 def not_checked(what: str, why: str) -> Check:
+    """A comparison that could not be made."""
     return Check(what, FitState.NOT_CHECKED, why)
 
 
 def fits(what: str, found: str) -> Check:
+    """A comparison that found nothing wrong."""
     return Check(what, FitState.FITS, found)
 
 

@@ -27,7 +27,7 @@ from schemas.run import Stream
 # Two lags so near to each other are of one clock.
 _SAME_CLOCK_S = 1.5
 # A clock with an old count of leap seconds (16 or 17 in place of 18, or none of the last three) is off by these; lags
-# of reads and odometers are known to so much beside their noise [s].
+# of reads and odometers are known to so much beyond their noise [s].
 _LEAPS_S = (2, 3)
 _WHOLE_NEAR_S = 0.3
 _LEAP_NEAR_S = 0.12
@@ -146,7 +146,7 @@ def _check(of: Recording, lag: StreamLag, of_gnss: StreamLag | None, known: bool
 
 
 def _large(what: str, found: str, of: Recording, lag: StreamLag, of_gnss: StreamLag | None, known: bool) -> Check:
-    """A lag that no train can have; `known`: other recorders tell whose it is."""
+    """A lag that no train can have; `known`: other recorders show whose it is."""
     clock = of_gnss or lag
     constant = Cause(MisfitCause.CONSTANT_LAG), round(clock.lag_s, 2)
     cause, exact_s = explain_lag(clock.lag_s, of.epoch_ns, min(3.0 * clock.sigma_s, 3.0)) or constant

@@ -17,7 +17,9 @@ from schemas.run import RunLog, Site
 
 @frozen
 class Recording:
-    """One solution of a cleaned run, its fixes and places, and whatever it meets; each comparison is made once."""
+    """One solution of a cleaned run, its fixes and places, and whatever it is compared with; each comparison is
+    made once.
+    """
 
     run: RunLog
     solution: str
@@ -59,7 +61,7 @@ class Recording:
 def recording_of(
     run: RunLog, solution: str, config: PlausibilityConfig, vehicle: Vehicle, site: Site | None
 ) -> Recording | None:
-    """None where hardly any position is valid."""
+    """The records of one solution; None where hardly any position is valid."""
     fixes = run.gnss.filter(pl.col("solution") == solution)
     gnss = places_of(fixes, int(times_ns(run.gnss)[0]))
     return None if gnss is None else Recording(run, solution, config, vehicle, site, fixes, gnss)

@@ -104,11 +104,13 @@ def fit_report(
 
 
 def _in_order(run: RunLog) -> RunLog:
+    """The run with its streams sorted by time, for a run that `clean` refuses."""
     streams: tuple[Stream, ...] = ("gnss", "odometer", "reference", "balise_reads")
     return run.with_streams(**{name: frame.sort("t") for name in streams if (frame := run.stream(name)) is not None})
 
 
 def _checks(fits: dict[str, Fit], counts: CleanCounts) -> pl.DataFrame:
+    """One row per check of each solution, with what cleaning left out."""
     columns = ("solution", "check", "state", "found", "cause")
     rows = [
         (name, check.what, check.state.value, check.found, check.cause)

@@ -22,7 +22,7 @@ S_PER_H = 3600.0
 
 @cache
 def published(name: str, *figures: str) -> pl.DataFrame:
-    """A table that the papers print, from its file beside this one; text but for figures."""
+    """A table that the papers print, from its file next to this one; text except for `figures`."""
     table = pl.read_csv((files("pipeline.studies.safety") / f"{name}.csv").read_bytes(), infer_schema=False)
     return table.cast(dict.fromkeys(figures, pl.Float64)).with_columns(pl.col(pl.String).fill_null(""))
 
@@ -61,7 +61,7 @@ def tolerable_gnss_rate_per_h(thr_per_h: float, time_to_detect_s: Figure, demand
 
 
 def tolerable_table(config: SafetyConfig) -> pl.DataFrame:
-    """The other way round: which hazard rate of GNSS a diagnosis of this speed could live with (TVB eq. 7)."""
+    """The reverse: which hazard rate of GNSS a diagnosis of this speed could live with (TVB eq. 7)."""
     thr = config.thr_vb_per_h
     demands = config.demands_per_hour
     time_s = pl.col("time_to_detect_s")

@@ -34,6 +34,8 @@ class LdsModel:
 
 @frozen
 class StateProbabilities:
+    """Probabilities of the four states P0 to P3 [1]; they sum to one."""
+
     p0: float
     p1: float
     p2: float
@@ -80,6 +82,7 @@ def numeric(model: LdsModel, t_h: float) -> StateProbabilities:
     """The model solved from its generator alone, as a check on the formulas."""
     from scipy.linalg import expm
 
+    # p(t) = p(0) exp(Q t) with p(0) = (1, 0, 0, 0): the first row of the matrix exponential.
     row = expm(generator(model) * t_h)[0]
     return StateProbabilities(*(float(value) for value in row))
 

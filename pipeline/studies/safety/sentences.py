@@ -11,7 +11,7 @@ from schemas.words import beside_words, say, say_of
 
 
 def verdict_statement(runs: pl.DataFrame) -> str:
-    """The verdict of the campaign with its counts and the figures beside it: the first words of what is said."""
+    """The verdict of the campaign with its counts and the figures next to it: the first words of what is said."""
     head = head_of(run_verdicts(runs).values())
     return f"{head}." if head.verdict is None else say("safety", "verdict", head, beside_words(figures_beside(runs)))
 
@@ -35,12 +35,12 @@ def _unjudged(runs: pl.DataFrame, alarms: pl.DataFrame) -> list[str]:
     said = []
     done = runs.filter(pl.col("status") != RunStatus.FAILED).sort("solution")
     for (solution,), rows in done.group_by("solution", maintain_order=True):
-        held_h, seen_h = (float(rows[name].sum()) / 3600.0 for name in ("held_s", "evidence_s"))
-        time = (solution, held_h - seen_h, held_h, rows["evidence"].null_count(), rows.height)
+        held_h, judged_h = (float(rows[name].sum()) / 3600.0 for name in ("held_s", "evidence_s"))
+        time = (solution, held_h - judged_h, held_h, rows["evidence"].null_count(), rows.height)
         unknown = alarms.filter((pl.col("solution") == solution) & (pl.col("verdict") == Verdict.UNKNOWN))
         doubtful = (solution, unknown.height, unknown["run_id"].n_unique())
         # Less than a second is not worth saying.
-        worth = held_h - seen_h >= 1.0 / 3600.0
+        worth = held_h - judged_h >= 1.0 / 3600.0
         said += sentences("safety", {"unchecked_time": worth and time, "unchecked_alarms": unknown.height and doubtful})
     return said
 

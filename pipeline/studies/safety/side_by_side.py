@@ -55,12 +55,25 @@ class _Diagnosed:
 def side_by_side(
     epochs: pl.DataFrame, hazards: pl.DataFrame, alarms: pl.DataFrame, runs: pl.DataFrame, config: Configuration
 ) -> pl.DataFrame:
-    """What each architecture made of one run (`COUNTS`), from its tables with all solutions.
+    """What each architecture made of one run, from its tables with all solutions.
 
-    `epochs` with `EPOCH_COLUMNS`. Working is: a valid, confident, unambiguous position (of both solutions where both
-    are needed), a diagnosis that judges, and no fail now nor in the recovery time before. T_D counts from the
-    fault's onset to the first fail. A false alarm of the comparison is one while both solutions were right. A pair has
-    one row, and the time of all rows is that of the run.
+    Working is: a valid, confident, unambiguous position (of both solutions where both are needed), a diagnosis that
+    judges, and no fail now nor in the recovery time before. T_D counts from the fault's onset to the first fail. A
+    false alarm of the comparison is one while both solutions were right. A pair has one row, and the time of all rows
+    is that of the run.
+
+    Args:
+        epochs: of all solutions of the run, with `EPOCH_COLUMNS`.
+        hazards: of the run.
+        alarms: of the run.
+        runs: its rows of `runs`, one per solution.
+        config: the configuration of the result.
+
+    Returns:
+        `COUNTS`, one row per architecture and solution or pair.
+
+    Source:
+        LOC section III, Fig. 3 and 4; LOC eq. 11.
     """
     names = sorted(runs.filter(pl.col("status") != RunStatus.FAILED)["solution"].to_list())
     solutions = {name: _solution(name, epochs, hazards, alarms, runs) for name in names}
@@ -108,6 +121,7 @@ def _reactive(solution: SolutionTables, config: Configuration) -> _Diagnosed:
 
 
 def _evaluated(monitor: str) -> pl.Expr:
+    """The monitor has a verdict at this epoch."""
     return pl.col(f"{monitor}_state").cast(pl.String) != MonitorState.NOT_EVALUATED.value
 
 
@@ -130,6 +144,7 @@ def _composite(first: SolutionTables, second: SolutionTables, config: Configurat
 
 
 def _period_s(solution: SolutionTables) -> float:
+    """Usual time between positions [s], 0 where there are hardly any."""
     return nominal_period_s(position_ns(solution.epochs)) or 0.0
 
 
@@ -151,8 +166,8 @@ def _channel(epochs: pl.DataFrame, monitors: tuple[str, ...], judged: pl.Expr, c
     columns = [f"{name}_{part}" for name in monitors for part in ("state", "value", "threshold")]
     fails = failure_log(epochs.select("t", *columns, negated=pl.lit(value=False)), config.lds.recovery_s)
     clock = Clock.of(epochs, config)
-    seen = holds(epochs, judged)
-    working = seen & holds(epochs, pl.col("trusted"))
+    evaluated = holds(epochs, judged)
+    working = evaluated & holds(epochs, pl.col("trusted"))
     for span in fails.alarms:
         until_ns = span.end_ns + round(config.lds.recovery_s * 1e9)
         working &= (clock.t_ns < span.start_ns) | (clock.t_ns > until_ns)
