@@ -1,4 +1,4 @@
-"""What was injected beside what a replay found."""
+"""What was injected against what a replay found."""
 
 from __future__ import annotations
 
@@ -117,8 +117,8 @@ def _row_text(row: dict[str, object], expected: ExpectedHazard | None) -> str:
 
 def _words(hazard: object, mode: object, timing: object, hit: object, accepted: object, detected: object) -> str:
     lists = [" ".join(ids) or "-" if isinstance(ids, list | tuple) else "-" for ids in (hit, accepted)]
-    seen = "detected" if detected else "not detected"
-    return f"{hazard} {mode} {timing}: {lists[0]}, accepted despite the fault {lists[1]}, {seen}"
+    detection = "detected" if detected else "not detected"
+    return f"{hazard} {mode} {timing}: {lists[0]}, accepted despite the fault {lists[1]}, {detection}"
 
 
 def _onsets(spec: RunSpec, run: RunLog, found: pl.DataFrame) -> list[Pair]:

@@ -60,10 +60,10 @@ class DemoResult:
     def lines(self) -> pl.DataFrame:
         """One line per run, `run_id, injected, verdict, hazards, checks`, as short as a terminal is wide."""
         of_runs = self.checks.group_by("run_id", maintain_order=True)
-        told = of_runs.agg(pl.col("injected").first(), pl.col("agrees").sum(), pl.len()).rows()
+        agreement = of_runs.agg(pl.col("injected").first(), pl.col("agrees").sum(), pl.len()).rows()
         rows = [
             (run_id, _in_short(injected), _verdict(one), _classes(one.hazards), f"{agreeing}/{of}")
-            for (run_id, injected, agreeing, of), one in zip(told, self.tables, strict=True)
+            for (run_id, injected, agreeing, of), one in zip(agreement, self.tables, strict=True)
         ]
         names = ("run_id", "injected", "verdict", "hazards", "checks")
         return pl.DataFrame(rows, schema=dict.fromkeys(names, pl.String), orient="row")

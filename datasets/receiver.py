@@ -51,9 +51,9 @@ class TrainOnLine:
         """Antenna places; `ahead_m` follows the track towards the leading end, `left_m` is left of that end."""
         lever_m = self.vehicle.gnss_antenna_ahead_m + ahead_m
         rail = self.line.at(self.motion.chainage_m(t_s) + self.motion.sign * lever_m)
-        beside = offset_places(rail, self.motion.sign * left_m)
+        over_ground = offset_places(rail, self.motion.sign * left_m)
         zeros = np.zeros(t_s.size)
-        return shifted(beside, zeros, zeros, zeros + self.vehicle.antenna_height_m)
+        return shifted(over_ground, zeros, zeros, zeros + self.vehicle.antenna_height_m)
 
 
 def gnss_streams(

@@ -52,7 +52,7 @@ class ElementSpec(Settings):
 
 
 class ParallelSpec(Settings):
-    """A second track beside the line, `left_m` to its left (negative: right), linked to nothing."""
+    """A second track parallel to the line, `left_m` to its left (negative: right), linked to nothing."""
 
     id: Identity
     from_m: NonNegative

@@ -145,9 +145,9 @@ def lost_words(
         The words, empty without losses.
     """
     losses = list(zip(lost_to or (), shares or (), strict=True))
-    beside = {LostTo.ALARM: f" (mostly {monitor})"} if monitor else {}
+    details = {LostTo.ALARM: f" (mostly {monitor})"} if monitor else {}
     named = [
-        f"{share:.0%} {LOST[LostTo(cause)]}{beside.get(LostTo(cause), '')}"
+        f"{share:.0%} {LOST[LostTo(cause)]}{details.get(LostTo(cause), '')}"
         for cause, share in losses[:_NAMED]
         if share >= _LEAST_SHARE
     ]
@@ -190,7 +190,7 @@ def part_words(run: Mapping[str, Any]) -> str:
     return say("verdicts", "part", *(run[f"part_{name}"] for name in ("verdict", "from", "to", "share")))
 
 
-def beside_words(run: Mapping[str, Any]) -> str:
+def verdict_figures_words(run: Mapping[str, Any]) -> str:
     """What is said next to every verdict: balises accepted of those on the path, availability, proof margin; and next
     to a safe one what it rests on by declaration alone.
 

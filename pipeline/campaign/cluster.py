@@ -120,8 +120,8 @@ class DaskEngine(Engine):
                 raise ConnectionError
             threads: int = sum(self._ask(self._client.scheduler.ncores).values())
         except Exception as error:
-            silent_s = time.monotonic() - self._heard_s
-            if isinstance(error, TimeoutError) and silent_s < WAITS.lonely_s:
+            unanswered_s = time.monotonic() - self._heard_s
+            if isinstance(error, TimeoutError) and unanswered_s < WAITS.lonely_s:
                 return self._threads
             raise lost_scheduler(self.name) from error
         self._heard_s = time.monotonic()

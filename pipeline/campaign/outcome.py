@@ -13,7 +13,7 @@ from pipeline.campaign.plan import RunJob
 from pipeline.results.figures.hazard_words import hazard_words
 from pipeline.results.figures.head import worst_verdict
 from pipeline.results.figures.known_counts import HAZARD_COUNTS, known_counts
-from pipeline.results.outcome import BESIDE, RunOutcome
+from pipeline.results.outcome import VERDICT_FIGURES, RunOutcome
 from pipeline.stages.provenance import Provenance
 from pipeline.storage.address import Address, redacted
 from schemas.enums import RunStatus, RunVerdict
@@ -117,16 +117,16 @@ def outcome_of(
         why=_why(runs, verdict),
         faults=tuple(hazard_words(hazards, passages)),
         log=redacted(log),
-        **_figures_beside_verdict(runs, verdict, low),
+        **_figures_of_verdict(runs, verdict, low),
     )
 
 
-def _figures_beside_verdict(runs: pl.DataFrame, verdict: RunVerdict | None, low: float) -> dict[str, Any]:
+def _figures_of_verdict(runs: pl.DataFrame, verdict: RunVerdict | None, low: float) -> dict[str, Any]:
     """What stands beside the verdict, of the solution that heads the run; nothing where all failed."""
     if verdict is None:
         return {}
     row = runs.filter(pl.col("verdict").cast(pl.String) == verdict.value).row(0, named=True)
-    figures = {name: row[name] for name in BESIDE}
+    figures = {name: row[name] for name in VERDICT_FIGURES}
     figures |= {name: tuple(row[name] or ()) for name in ("remedies", "remedies_gain")}
     available = row["availability"]
     if available is None or available >= low:

@@ -158,8 +158,8 @@ def taken_from_project(
     _require_measured(opened, values)
     taken = {name: value for name, value in values.items() if name in missing}
     if taken and say is not None:
-        told = ", ".join(f"{name} {_shown(value)}" for name, value in taken.items())
-        say(f"balise: from {opened.file}: {told}")
+        taken_words = ", ".join(f"{name} {_shown(value)}" for name, value in taken.items())
+        say(f"balise: from {opened.file}: {taken_words}")
     return values
 
 

@@ -16,7 +16,7 @@ from pipeline.project.convert import Recordings, logs_of, run_of_logs
 from pipeline.project.made import Product, Record, digest_over
 from pipeline.project.opened import MEASURED_CONFIG, MEASURED_VEHICLE, RECORD, Opened, named_from
 from pipeline.read.ingest import read_run
-from pipeline.read.site.alike import told_in_short
+from pipeline.read.site.alike import summarise_findings
 from pipeline.read.site.read import read_site
 from pipeline.results import store
 from pipeline.results.manifest import settings_files
@@ -220,7 +220,7 @@ def _write_site(steps: _Steps, wish: Wish, site: Path, vehicle: Vehicle, config:
     steps.call.said("site", f"made of {', '.join(path.name for path in wish.surveys)}")
     made = make_site(wish, vehicle, config)
     write_made(made, site_page(site.resolve().name, made), site, True)
-    for line in told_in_short(made.findings, f"{site / 'findings.csv'}"):
+    for line in summarise_findings(made.findings, f"{site / 'findings.csv'}"):
         steps.call.said("site", line)
     count = len(made.findings)
     steps.call.said("site", f"{count} findings in {site / 'findings.csv'}; look at {site / 'site.html'}")

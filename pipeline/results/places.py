@@ -41,7 +41,7 @@ def ground_of(track: pl.DataFrame, netelement_id: pl.Series, measure_m: Floats) 
     return GroundPositions(*columns)
 
 
-def beside(ground: GroundPositions, sign: Floats, left_m: Floats, above_m: Floats) -> GroundPositions:
+def offset_positions(ground: GroundPositions, sign: Floats, left_m: Floats, above_m: Floats) -> GroundPositions:
     """Places `left_m` to the left of growing path and `above_m` over the rails.
 
     `sign` is +1 where path and measure grow together, -1 where against each other. For metres, not kilometres.

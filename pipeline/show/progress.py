@@ -266,7 +266,7 @@ def show_summary(
 
 def summary_answer(summary: CampaignSummary, out: str) -> dict[str, object]:
     """The same for programs."""
-    head = {"verdict": summary.head.word, "verdicts": summary.head.counts(), **summary.beside()}
+    head = {"verdict": summary.head.word, "verdicts": summary.head.counts(), **summary.verdict_figures()}
     figures = {"planned": summary.planned, "left": summary.left, "skipped": summary.skipped}
     return {**head, **figures, "seconds": round(summary.seconds, 3), "out": out, "runs": outcome_rows(summary)}
 

@@ -107,8 +107,8 @@ def declared_of(folder: Path) -> Declared | None:
     except ImportError:
         return None
     try:
-        told = YAML(typ="safe", pure=True).load((folder / "metadata.yaml").read_text(encoding="utf-8"))
-        bag = told["rosbag2_bagfile_information"]
+        metadata = YAML(typ="safe", pure=True).load((folder / "metadata.yaml").read_text(encoding="utf-8"))
+        bag = metadata["rosbag2_bagfile_information"]
         # Older writers name the folder too.
         names = tuple(PurePosixPath(str(name)).name for name in bag["relative_file_paths"])
         packed = str(bag.get("compression_mode") or "").upper() in ("FILE", "MESSAGE")
@@ -158,13 +158,13 @@ def _absent(folder: Path, declared: Declared, found: Sequence[Path]) -> Iterator
 
 
 def _undeclared(folder: Path, declared: Declared) -> Iterator[str]:
-    beside = sorted(path.name for path in folder.iterdir() if path.suffix in (".mcap", ".db3"))
+    others = sorted(path.name for path in folder.iterdir() if path.suffix in (".mcap", ".db3"))
     known = {name.removesuffix(".zstd") for name in declared.files}
-    yield from (f"{name} is not declared, and not read" for name in beside if name not in known)
+    yield from (f"{name} is not declared, and not read" for name in others if name not in known)
 
 
 def _fewer(declared: Declared, counts: Mapping[str, int]) -> Iterator[str]:
-    """Topics of which fewer messages were met than are declared."""
+    """Topics of which fewer messages were found than are declared."""
     lost = {topic: wanted for topic, wanted in sorted(declared.topics.items()) if counts.get(topic, 0) < wanted}
     for topic, wanted in lost.items():
         yield f"holds {counts.get(topic, 0)} of {wanted} messages of {topic} that are declared"

@@ -153,11 +153,11 @@ def _refuse_unlike(
 ) -> None:
     """Rows of one stream that were corrected in different ways could not be told apart."""
     if one != other:
-        ways = [", ".join(made.changes for made in held) or "none" for held in (one, other)]
+        changes = [", ".join(made.changes for made in held) or "none" for held in (one, other)]
         raise InputError(
             f"receivers of one {stream} with different corrections",
             place=str(place),
-            found=" and ".join(ways),
+            found=" and ".join(changes),
             remedy="Convert them with one configuration; `solution` in [[ingest.correct]] names which it is for.",
         )
 
@@ -424,8 +424,8 @@ def _read(
 
 def _no_epoch(content: bytes, log: Path, dropped: Mapping[str, int]) -> InputError:
     """What there is in place of positions tells what to change at the receiver."""
-    met = Counter(name_of(frame) for frame in frames(content, lambda: None))
-    if not met:
+    counts = Counter(name_of(frame) for frame in frames(content, lambda: None))
+    if not counts:
         head = content[:_HEAD]
         hint = next((hint for pattern, hint in _ALMOST.items() if re.search(pattern, head)), _OTHER)
         return UnknownError(
@@ -437,7 +437,7 @@ def _no_epoch(content: bytes, log: Path, dropped: Mapping[str, int]) -> InputErr
     return NoEpochError(
         "no epoch with a time and a position",
         place=str(log),
-        found=", ".join(f"{name} ({count})" for name, count in met.most_common(_MOST_NAMES)),
+        found=", ".join(f"{name} ({count})" for name, count in counts.most_common(_MOST_NAMES)),
         expected="UBX NAV-PVT, SBF PVTGeodetic or PVTCartesian, NMEA GGA, GNS or RMC with a date, "
         "NovAtel BESTPOS or INSPVA",
         remedy="Let the receiver record one of these messages, or give the day of NMEA without one by --date."

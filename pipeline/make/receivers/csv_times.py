@@ -171,7 +171,7 @@ def _from_zone(local_ns: pl.Series, local: pl.Series, zone: str, place: str) -> 
         )
         expected = "times that there are; clocks leave an hour out in spring"
         _refuse(never, civil, place, f"holds a time that clocks never show in {zone}", expected, remedy)
-    instants, unclear = _told_apart(local_ns, first, second, local & (first != second))
+    instants, unclear = _resolve_repeated_hours(local_ns, first, second, local & (first != second))
     if unclear.any():
         row = int(unclear.arg_max() or 0)
         zones = " or ".join(_fixed_zone(local_ns[row] - utc_ns[row]) for utc_ns in (first, second))
@@ -185,8 +185,8 @@ def _from_zone(local_ns: pl.Series, local: pl.Series, zone: str, place: str) -> 
 def _refuse_other_letters(utc_ns: pl.Series, letters: pl.Series, texts: pl.Series, zone: str, place: str) -> None:
     """Refuse letters behind times that are not those of the zone then: CET in summer is another hour than CEST."""
     then = utc_ns.cast(pl.Datetime("ns", "UTC")).dt.convert_time_zone(zone).dt.to_string("%Z")
-    told = letters.replace(_GERMAN_LETTERS)
-    wrong = told.is_not_null() & then.str.contains("^[A-Z]+$") & (told != then)
+    english = letters.replace(_GERMAN_LETTERS)
+    wrong = english.is_not_null() & then.str.contains("^[A-Z]+$") & (english != then)
     remedy = "Name the zone of these letters, or one of a fixed offset, such as Etc/GMT-1."
     _refuse(wrong, texts, place, f"holds times whose letters are not those of {zone}", "letters of this zone", remedy)
 
@@ -197,7 +197,7 @@ def _fixed_zone(ahead_ns: int) -> str:
     return f'"Etc/GMT{-hours:+d}"' if hours else '"UTC"'
 
 
-def _told_apart(
+def _resolve_repeated_hours(
     local_ns: pl.Series, first: pl.Series, second: pl.Series, twice: pl.Series
 ) -> tuple[pl.Series, pl.Series]:
     """The instants with each hour that is shown `twice` told apart by the order of its rows, and where it cannot be.

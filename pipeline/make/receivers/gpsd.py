@@ -46,16 +46,16 @@ def read_gpsd(
     """Streams, and what could not be used. `solution`: the device that is meant, where the log holds several."""
     gathered = Gathered()
     devices: Counter[str] = Counter()
-    seen = list(_objects(content, gathered))
-    for seen_object in seen:
-        if seen_object["class"] == "TPV" and _has_fix(seen_object):
-            devices[_device(seen_object)] += 1
+    reports = list(_objects(content, gathered))
+    for report in reports:
+        if report["class"] == "TPV" and _has_fix(report):
+            devices[_device(report)] += 1
     chosen = next((name for name in devices if solution in (name, name.rsplit("/", 1)[-1])), None)
     if len(devices) > 1 and chosen is None:
-        raise two_receivers(str(log), frozenset(devices), _apart_m(seen), "device")
-    for seen_object in seen:
-        if len(devices) < 2 or _device(seen_object) == chosen:
-            _DECODERS[seen_object["class"]](gathered, seen_object)
+        raise two_receivers(str(log), frozenset(devices), _apart_m(reports), "device")
+    for report in reports:
+        if len(devices) < 2 or _device(report) == chosen:
+            _DECODERS[report["class"]](gathered, report)
     if (apart_m := sees_twins(gathered)) is not None:
         raise two_receivers(str(log), frozenset(), apart_m)
     epochs = gathered.settled()
@@ -101,11 +101,11 @@ def _number(found: dict[str, Any], name: str, other: Any = None) -> Any:
     return float(value) if known and isinstance(value, int | float) else other
 
 
-def _apart_m(seen: list[dict[str, Any]]) -> float:
+def _apart_m(reports: list[dict[str, Any]]) -> float:
     """How far apart devices tell to be at one time [m]; 0 where they never tell of the same."""
     places: dict[int, tuple[str, tuple[float, float]]] = {}
     widest_m = 0.0
-    for found in seen:
+    for found in reports:
         t_ns = _time_ns(found)
         if t_ns is None or found["class"] != "TPV" or not _has_fix(found):
             continue

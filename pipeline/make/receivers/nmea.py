@@ -142,10 +142,10 @@ def settle_days(gathered: Gathered, first_day: date | None = None) -> None:
     gathered.drop("time without a date", len(early))
     dropped = {epoch.number for epoch in early}
     gathered.epochs = [epoch for epoch in epochs if epoch.number not in dropped]
-    for way in (1, -1):
-        for known, epoch in pairwise(gathered.epochs[::way]):
+    for sense in (1, -1):
+        for known, epoch in pairwise(gathered.epochs[::sense]):
             if epoch.t_ns is None and known.t_ns is not None:
-                epoch.t_ns = _time_next_to(known.t_ns, epoch.key, way)
+                epoch.t_ns = _time_next_to(known.t_ns, epoch.key, sense)
 
 
 def _turned_dates(epochs: list[Epoch]) -> int:
@@ -170,10 +170,10 @@ def _turned_dates(epochs: list[Epoch]) -> int:
     return turned
 
 
-def _time_next_to(known_ns: int, moment: time, way: int) -> int:
+def _time_next_to(known_ns: int, moment: time, sense: int) -> int:
     """The time of an epoch after (1) or before (-1) one whose time is known: of the same day, or past midnight."""
     t_ns = known_ns - known_ns % _DAY_NS + _time_ns(date(1970, 1, 1), moment)
-    return t_ns + way * _DAY_NS if way * (known_ns - t_ns) > _DAY_NS // 2 else t_ns
+    return t_ns + sense * _DAY_NS if sense * (known_ns - t_ns) > _DAY_NS // 2 else t_ns
 
 
 def _time_ns(day: date, moment: time) -> int:

@@ -82,8 +82,8 @@ def settle_source(gathered: Gathered) -> None:
     best = max(names, key=lambda name: _RANKS[name], default=None)
     if best is None:
         return
-    others_beside = [epoch for epoch in gathered.epochs if epoch.positions and best not in epoch.positions]
-    gathered.drop(f"NovAtel position beside those of {best}", len(others_beside))
+    others = [epoch for epoch in gathered.epochs if epoch.positions and best not in epoch.positions]
+    gathered.drop(f"NovAtel position beside those of {best}", len(others))
     gathered.epochs = [epoch for epoch in gathered.epochs if best in epoch.positions]
     _give(velocities, gathered.epochs)
 

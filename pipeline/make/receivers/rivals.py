@@ -110,12 +110,12 @@ def _place(epoch: Epoch) -> tuple[float, float] | None:
 
 def two_receivers(place: str, names: frozenset[str], apart_m: float, option: str = "talker") -> InputError:
     """What to do about a log of two receivers; `names`: those by which they can be told apart."""
-    told = " and ".join(sorted(names))
+    talkers = " and ".join(sorted(names))
     choose = ", ".join(f"--solution {name}" for name in sorted(names))
     return InputError(
         "holds the positions of two receivers",
         place=place,
-        found=(f"{told}, " if names else "messages of one kind and time, ") + f"up to {apart_m:.1f} m apart",
+        found=(f"{talkers}, " if names else "messages of one kind and time, ") + f"up to {apart_m:.1f} m apart",
         expected="one receiver, or the one that is meant",
         remedy=f"Convert one {option} at a time, each as its own solution: {choose}."
         if names

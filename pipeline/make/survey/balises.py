@@ -26,9 +26,9 @@ from schemas.inputs import Balises
 
 
 def balises_every(network: SurveyNetwork, spacing_m: float, travel: TravelAlong) -> pl.DataFrame:
-    """Virtual balises at whole multiples of the spacing, counted along the shortest way from the survey's start.
+    """Virtual balises at whole multiples of the spacing, counted along the shortest route from the survey's start.
 
-    So the spacing holds over joints and switches; where two ways meet again it begins anew. `travel`: for trains away
+    So the spacing holds over joints and switches; where two routes meet again it begins anew. `travel`: for trains away
     from the survey's start, back to it, or both.
     """
     track = track_of(network.track)
@@ -38,9 +38,11 @@ def balises_every(network: SurveyNetwork, spacing_m: float, travel: TravelAlong)
         at_start, at_end = from_start[network.ends[element]]
         length = float(track.length_m[element])
         begins = min(at_start, at_end)
-        way = np.arange(np.floor(begins / spacing_m) + 1, np.floor((begins + length) / spacing_m) + 1) * spacing_m
+        chainage_m = (
+            np.arange(np.floor(begins / spacing_m) + 1, np.floor((begins + length) / spacing_m) + 1) * spacing_m
+        )
         away = bool(at_start <= at_end)
-        measures = way - begins if away else length - (way - begins)
+        measures = chainage_m - begins if away else length - (chainage_m - begins)
         side = {"netelement_id": name, "direction": _direction(away, travel).value}
         rows += [{**side, "measure_m": float(measure)} for measure in np.clip(measures, 0.0, length)]
     ids = [f"VB{number:0{len(str(len(rows)))}}" for number in range(1, len(rows) + 1)]

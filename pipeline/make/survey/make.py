@@ -135,8 +135,8 @@ def write_made(site: Site, page: str, out: Path, force: bool) -> None:
         if table is not None
     }
     findings = pl.DataFrame([asdict(one) for one in site.findings], schema=list(Finding.__dataclass_fields__))
-    beside = {"findings.csv": findings.write_csv().encode(), "site.html": page.encode()}
-    replace_files(out, {**contents, **written, **beside}, marker="track.parquet")
+    companions = {"findings.csv": findings.write_csv().encode(), "site.html": page.encode()}
+    replace_files(out, {**contents, **written, **companions}, marker="track.parquet")
 
 
 def _number(text: str) -> float | None:

@@ -68,8 +68,8 @@ def _copied(path: Path, data: bytes, config: SurveyConfig) -> Iterator[_Copy]:
         file.write_bytes(data)
         size_bytes = len(data)
         for ending in _COMPANIONS[file.suffix]:
-            beside = [_companion(path, one) for one in (ending, ending.upper())]
-            found = [one for one in beside if exists(one)]
+            companions = [_companion(path, one) for one in (ending, ending.upper())]
+            found = [one for one in companions if exists(one)]
             if found:
                 size_bytes += _companion(file, ending).write_bytes(content_of_survey(found[0], config))
         yield _Copy(file, size_bytes)

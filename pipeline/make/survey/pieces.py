@@ -167,14 +167,16 @@ def with_own_names(pieces: list[LinePiece]) -> list[LinePiece]:
     return named
 
 
-def kilometre_spans(line_km: Floats, way_m: Floats, config: SurveyConfig) -> tuple[Ints, Floats, np.ndarray]:
-    """Points with a kilometre; how far [m] the kilometres stray from the way to the next of them; where they jump."""
+def kilometre_spans(line_km: Floats, distance_m: Floats, config: SurveyConfig) -> tuple[Ints, Floats, np.ndarray]:
+    """Points with a kilometre; how far [m] the kilometres stray from the distance to the next of them; where they
+    jump.
+    """
     known = np.flatnonzero(np.isfinite(line_km))
     by_km = np.diff(line_km[known]) * 1000.0
-    by_way = np.diff(way_m[known])
+    by_distance = np.diff(distance_m[known])
     sign = 1.0 if by_km.sum() >= 0 else -1.0
-    off_m = np.abs(sign * by_km - by_way)
-    return known, off_m, off_m > np.maximum(config.kilometre_m, config.kilometre_share * by_way)
+    off_m = np.abs(sign * by_km - by_distance)
+    return known, off_m, off_m > np.maximum(config.kilometre_m, config.kilometre_share * by_distance)
 
 
 def measures_at(line_km: Floats, measure_m: Floats, km: float, config: SurveyConfig) -> list[float]:

@@ -135,8 +135,8 @@ def _shares() -> dict[str, pl.Expr]:
     shares: dict[str, pl.Expr] = {}
     for state in _STATES:
         spent = (pl.col(f"share_{state}").fill_null(0.0) * held).filter(counted).sum()
-        seen = (whole > 0.0) & truth.any() if state in ("p0", "p1") else whole > 0.0
-        shares[f"share_{state}"] = pl.when(seen).then((spent / whole).clip(upper_bound=1.0))
+        known = (whole > 0.0) & truth.any() if state in ("p0", "p1") else whole > 0.0
+        shares[f"share_{state}"] = pl.when(known).then((spent / whole).clip(upper_bound=1.0))
     left = 1.0 - pl.sum_horizontal(share.fill_null(0.0) for share in shares.values())
     unknown = pl.when(whole > 0.0).then(pl.when(left > _ROUNDING).then(left).otherwise(0.0))
     return shares | {"share_unknown": unknown}

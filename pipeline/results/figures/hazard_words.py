@@ -34,8 +34,8 @@ def withstood(hazards: pl.DataFrame) -> str:
     parts = []
     for (kind,), rows in faults.group_by(kinds, maintain_order=True):
         for (detected,), part in rows.group_by("detected", maintain_order=True):
-            met = _response_words(part, detected=bool(detected))
-            parts.append(f"{part.height} {kind}{'s' * (part.height > 1)}{_sizes(part['size_m'])} {met}")
+            response = _response_words(part, detected=bool(detected))
+            parts.append(f"{part.height} {kind}{'s' * (part.height > 1)}{_sizes(part['size_m'])} {response}")
     return ", ".join(parts)
 
 

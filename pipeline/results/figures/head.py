@@ -61,7 +61,7 @@ def run_verdicts(runs: pl.DataFrame) -> dict[str, RunVerdict | None]:
     return {run_id: worst_verdict(verdicts) for run_id, verdicts in listed.iter_rows()}
 
 
-def figures_beside(runs: pl.DataFrame) -> Mapping[str, Any]:
+def verdict_figures(runs: pl.DataFrame) -> Mapping[str, Any]:
     """The figures beside a campaign's verdict: sums, availability by moving time, the least margin, and where the
     odometers of its safe runs come from by their declarations.
     """

@@ -99,9 +99,11 @@ def campaign_page(campaign: Campaign, made: Made) -> str:
         "limits": {"failure_limit_m": made.config.hazards.failure_limit_m},
     }
     href = campaign.hrefs.get(named or "", "")
-    way = f'<p class="ways">{link(href, f"Open run {named}")}</p>' if href else ""
+    link_to_run = f'<p class="ways">{link(href, f"Open run {named}")}</p>' if href else ""
     count = plural(campaign.runs["run_id"].n_unique(), "run")
-    heading = verdict_head(head.word, head.worst, head.reasons, head.beside) + way + f"<h1>Campaign of {count}</h1>"
+    heading = (
+        verdict_head(head.word, head.worst, head.reasons, head.figures) + link_to_run + f"<h1>Campaign of {count}</h1>"
+    )
     foot = ", ".join(campaign.runs["software"].unique().sort().to_list())
     title = f"Campaign · balise: {head.word}"
     return page(title, heading, "\n".join(body), script_json(data), "campaign.js", foot)

@@ -63,8 +63,8 @@ def figures(identity: str, caption: str, row: Row, contract: type[dy.Schema]) ->
 
 def _figure_names(names: Collection[str]) -> list[str]:
     """The columns that are no bounds of others."""
-    beside = {bound for pair in bounds_of(names).values() for bound in pair}
-    return [name for name in names if name not in beside]
+    bounds = {bound for pair in bounds_of(names).values() for bound in pair}
+    return [name for name in names if name not in bounds]
 
 
 def _meanings(contract: type[dy.Schema] | None) -> dict[str, str]:

@@ -11,10 +11,10 @@ import numpy as np
 import polars as pl
 
 from pipeline.results.places import (
-    beside,
     element_lines_m,
     ground_at,
     ground_of,
+    offset_positions,
     origin_of,
     plane_m,
     sign_of,
@@ -54,7 +54,7 @@ class _View:
             return floats(epochs, "path_m"), cross_m
         rails = ground_of(self.site.track, epochs["netelement_id"], floats(epochs, "measure_m"))
         sign = sign_of(epochs, self.stretches)
-        return plane_m(beside(rails, sign, cross_m, np.zeros(len(cross_m))), self.origin)
+        return plane_m(offset_positions(rails, sign, cross_m, np.zeros(len(cross_m))), self.origin)
 
 
 def plan_data(epochs: pl.DataFrame, passages: pl.DataFrame, site: Site | None, moments_ns: Ints) -> Json:
@@ -125,7 +125,7 @@ def _balises(view: _View, passages: pl.DataFrame) -> list[Json]:
         {
             "id": row["balise_id"],
             "outcome": OUTCOMES[row["worst"]],
-            "outcomes": ", ".join(sorted(f"{met['count']} {met['outcome']}" for met in row["outcomes"])),
+            "outcomes": ", ".join(sorted(f"{entry['count']} {entry['outcome']}" for entry in row["outcomes"])),
             "place": f"{row['netelement_id']} at {row['measure_m']:.1f} m",
             "x": _rounded(x[number]),
             "y": _rounded(y[number]),

@@ -148,10 +148,16 @@ def _pages(out: Path, site: Site | None, markers: Mapping[str, str], most_pages:
     names = {run: page_name(run) for run in complete_runs(out)}
     config = read_config(out)
     made = Made(config or Configuration(), None if config is None else to_toml(config), site)
-    ways = [None, *((run, quote(name)) if len(names) <= most_pages else None for run, name in names.items()), None]
+    neighbours = [
+        None,
+        *((run, quote(name)) if len(names) <= most_pages else None for run, name in names.items()),
+        None,
+    ]
     folder = out / "report" / "runs"
     return [
-        _with_digest(_Page(out, run, folder / name, made, Neighbours(ways[at], ways[at + 2])), markers.get(run, ""))
+        _with_digest(
+            _Page(out, run, folder / name, made, Neighbours(neighbours[at], neighbours[at + 2])), markers.get(run, "")
+        )
         for at, (run, name) in enumerate(names.items())
     ]
 

@@ -132,7 +132,7 @@ class OneTrack:
     def _together_m(self, one: int, other: int) -> float:
         """Distance from their common begin over which two branches are nearer than `apart_m`."""
         distances_m, places = zip(*(self._drawn(oriented) for oriented in (one, other)), strict=True)
-        last_m = min(float(at_m[-1]) for at_m in distances_m)
+        last_m = min(float(distance_m[-1]) for distance_m in distances_m)
         at_m = np.union1d(*distances_m)
         at_m = at_m[at_m <= last_m]
         first, second = (

@@ -4,16 +4,20 @@ from __future__ import annotations
 
 import polars as pl
 
-from pipeline.results.figures.head import figures_beside, head_of, run_verdicts
+from pipeline.results.figures.head import head_of, run_verdicts, verdict_figures
 from pipeline.studies.reservations import failed_runs, sentences, several_settings
 from schemas.enums import RunStatus, Verdict
-from schemas.words import beside_words, say, say_of
+from schemas.words import say, say_of, verdict_figures_words
 
 
 def verdict_statement(runs: pl.DataFrame) -> str:
     """The verdict of the campaign with its counts and the figures next to it: the first words of what is said."""
     head = head_of(run_verdicts(runs).values())
-    return f"{head}." if head.verdict is None else say("safety", "verdict", head, beside_words(figures_beside(runs)))
+    return (
+        f"{head}."
+        if head.verdict is None
+        else say("safety", "verdict", head, verdict_figures_words(verdict_figures(runs)))
+    )
 
 
 def reservations(runs: pl.DataFrame, alarms: pl.DataFrame) -> list[str]:
