@@ -32,6 +32,7 @@ class ComparisonRow:
 
     @property
     def agrees(self) -> bool:
+        """The replay found what was injected."""
         return self.expected == self.found
 
 

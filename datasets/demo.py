@@ -49,6 +49,7 @@ class DemoResult:
 
     @property
     def agrees(self) -> bool:
+        """Every check of the demonstration holds."""
         return bool(self.checks["agrees"].all())
 
     @property
@@ -131,9 +132,11 @@ class _Replayed(CampaignWatch):
         self._progress = progress
 
     def counted(self, outcome: RunOutcome) -> None:
+        """Say that a run is done."""
         self._progress(f"{outcome.run_id}: replayed")
 
     def noted(self, text: str) -> None:
+        """Say a sentence."""
         self._progress(text)
 
 

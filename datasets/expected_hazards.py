@@ -51,11 +51,13 @@ class _World:
     margin_m: float
 
     def passed(self, a_m: float, b_m: float) -> frozenset[str]:
+        """Virtual balises between two places."""
         low = min(a_m, b_m)
         high = max(a_m, b_m)
         return frozenset(n for n, at in zip(self.names, self.places_m, strict=True) if low < at <= high)
 
     def near(self, at_m: float) -> bool:
+        """Whether a place is too near to a balise for noise to leave the answer certain."""
         return bool((np.abs(self.places_m - at_m) <= self.margin_m).any())
 
 

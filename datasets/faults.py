@@ -109,13 +109,16 @@ class FaultSpec(Settings):
 
     @property
     def hits_ranges(self) -> bool:
+        """It is a fault of ranges: of a satellite, or of a group of them."""
         return self.target in _GROUPS or self.target[:1].isupper()
 
     @property
     def hits_odometer(self) -> bool:
+        """It is a fault of the odometer."""
         return self.target == "odometer"
 
     def begins_s(self) -> float:
+        """When it begins [s]."""
         return self.start_s or 0.0
 
 

@@ -35,6 +35,7 @@ class _RecordedRanges:
     used: Bools
 
     def solved(self, range_error_m: Floats, usable: Bools) -> PositionSolution:
+        """The position errors that errors of ranges make, (epochs, satellites)."""
         angles = (np.nan_to_num(self.azimuth_deg), np.nan_to_num(self.elevation_deg))
         return solve(self.svs, *angles, self.sigma_m, range_error_m, usable, self.recorded)
 

@@ -43,6 +43,7 @@ class LineAxis:
 
     @property
     def length_m(self) -> float:
+        """Length of the line [m]."""
         return float(self.chainage_m[-1])
 
     def at(self, s_m: Floats) -> RailPlaces:

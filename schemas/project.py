@@ -98,6 +98,7 @@ class ConvertEntry(Settings):
 
     @property
     def run_id(self) -> str:
+        """The run id that the converted run has."""
         return Path(self.to).name.removesuffix(".mcap")
 
 

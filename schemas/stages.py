@@ -372,6 +372,7 @@ class EpochFigures:
         return self.is_judged(Judgement.RIGHT) | self.is_judged(Judgement.WRONG)
 
     def is_judged(self, judgement: Judgement) -> Bools:
+        """Epochs with this judgement."""
         return np.asarray(self.judgement == tuple(Judgement).index(judgement))
 
     def confident(self, limit_m: float) -> Bools:

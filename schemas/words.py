@@ -91,6 +91,7 @@ class Remark:
 
     @property
     def words(self) -> str:
+        """The note as a sentence."""
         return NOTES[self.note].format(*self.figures)
 
 

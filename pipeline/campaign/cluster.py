@@ -54,9 +54,11 @@ class DaskEngine(Engine):
         return max(1, 2 * self._threads)
 
     def lonely_s(self) -> float:
+        """For how long there has been no worker [s]."""
         return 0.0 if self._threads else time.monotonic() - self._seen_s
 
     def submit(self, job: RunJob) -> Result:
+        """Hand a run to the cluster; the result is set when its task ends, however that was."""
         task = self._client.submit(replay_there, job, self._limit_s + WAITS.grace_s, pure=False)
         result: Result = Future()
         self._tasks[result] = task
@@ -78,11 +80,13 @@ class DaskEngine(Engine):
         threading.Thread(target=self._end, args=(task, self._workers.get(task.key, "")), daemon=True).start()
 
     def is_lost_worker(self, error: BaseException) -> bool:
+        """Whether an error means that the worker died."""
         from distributed.scheduler import KilledWorker
 
         return isinstance(error, LostWorkerError | KilledWorker)
 
     def collected(self, result: Result) -> None:
+        """Forget a task whose result has been taken."""
         key = self._tasks.pop(result).key
         self._workers.pop(key, None)
         if self._client.status == "running":
@@ -90,6 +94,7 @@ class DaskEngine(Engine):
                 self._ask(self._client.scheduler.event_clear, name=key)
 
     def close(self) -> None:
+        """Leave the cluster; its workers stay."""
         with contextlib.suppress(Exception):
             self._client.close(timeout=1)
 
@@ -172,6 +177,7 @@ def _begin() -> None:
 
 
 def lost_scheduler(scheduler: str) -> UsageError:
+    """The error for a scheduler that does not answer any more."""
     return UsageError(
         "the Dask scheduler does not answer",
         place=redacted(scheduler),

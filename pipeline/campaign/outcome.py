@@ -43,14 +43,17 @@ class ChangedError(InputError):
 
 
 def changed(address: Address) -> ChangedError:
+    """The error for a log that changed while it was read."""
     return ChangedError("changed while it was read", place=str(address), remedy="Replay it again when it is complete.")
 
 
 def overdue(limit_s: float) -> str:
+    """The error text of a run that took too long."""
     return f"took longer than the time limit of {limit_s:g} s"
 
 
 def lost(attempts: int) -> str:
+    """The error text of a run whose workers died."""
     return (
         f"its worker died {attempts} times (killed, or out of memory). "
         "Give it more memory or fewer --jobs; the next call tries it again."
@@ -58,6 +61,7 @@ def lost(attempts: int) -> str:
 
 
 def never_begun(workers: int) -> str:
+    """The error text of a run for which no worker came up."""
     return f"{workers} workers died before they started this run. See the logs of the workers."
 
 

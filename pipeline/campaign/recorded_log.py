@@ -65,6 +65,7 @@ class RecordedLog:
             self._check_unchanged(path)
 
     def read(self, path: Path) -> RunLog:
+        """Read the run from a local copy; a file that makes the reader panic is damaged."""
         try:
             run = read_run(path, self._job.config.ingest)
         except pl.exceptions.PanicException as error:

@@ -69,10 +69,12 @@ class Verification:
 
     @property
     def table(self) -> pl.DataFrame:
+        """One row per problem."""
         return pl.DataFrame(self.problems, schema=dict.fromkeys(_COLUMNS, pl.String), orient="row")
 
     @property
     def sentence(self) -> str:
+        """How much was compared, and how much of it does not agree, for people."""
         left_out = " and ".join(_NOT_COMPARED[item] for item in self.not_compared)
         rest = f"; not compared: {left_out}" if left_out else ""
         return f"{self.compared}: {f'{len(self.problems)} do not' if self.problems else 'all'} agree{rest}"

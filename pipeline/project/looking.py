@@ -55,6 +55,7 @@ class InspectedLog:
 
     @property
     def has_positions(self) -> bool:
+        """It holds positions of a receiver."""
         return "gnss" in self.spans
 
     @property
@@ -64,9 +65,11 @@ class InspectedLog:
 
     @property
     def end(self) -> datetime:
+        """The last instant of any stream."""
         return max(span.end for span in self._spans())
 
     def overlaps(self, other: InspectedLog) -> bool:
+        """Whether the times of two logs overlap."""
         return self.start < other.end and other.start < self.end
 
     def _spans(self) -> list[StreamSpan]:

@@ -29,6 +29,7 @@ class Opened:
 
     @property
     def folder(self) -> Path:
+        """The folder that its paths are relative to."""
         return self.file.parent
 
     def place(self, named: str) -> str:
@@ -42,6 +43,7 @@ class Opened:
         return os.path.normpath(self.folder / (path.expanduser() if path.parts[:1] == ("~",) else path))
 
     def path(self, named: str | None) -> Path | None:
+        """A path that the project names, from the working directory; None where it names none."""
         return None if named is None else Path(self.place(named))
 
     @property
@@ -85,6 +87,7 @@ class Opened:
         return configuration_of(self.project, self.file)
 
     def given_vehicle(self) -> Vehicle:
+        """The vehicle file of the project, or what nothing is known of."""
         return load_settings(self.path(self.project.vehicle), Vehicle)
 
     def runs(self) -> list[str]:

@@ -24,6 +24,7 @@ class RecordedRun:
 
     @property
     def logs(self) -> list[InspectedLog]:
+        """All logs of the run."""
         return [*(log for files in self.receivers for log in files), *self.references, *self.others]
 
     @property

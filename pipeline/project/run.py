@@ -78,6 +78,7 @@ class _Steps:
     changed: list[str] = field(default_factory=list)
 
     def bring(self, product: Product, make: Callable[[], Sequence[Path]]) -> bool:
+        """Make a product where its inputs changed; whether it was made."""
         brought = self.record.bring(product, make)
         if brought.made:
             self.changed.append(product.name)

@@ -341,6 +341,7 @@ def _of_all(said: Mapping[str, Sequence[str]]) -> list[str]:
 
 
 def correction_lines(corrections: Sequence[StreamCorrection]) -> list[str]:
+    """Corrections as lines of a project file."""
     tables = [tomli_w.dumps(correction.model_dump(exclude_defaults=True)) for correction in corrections]
     return [line for table in tables for line in ("[[convert.correct]]", *table.splitlines())]
 

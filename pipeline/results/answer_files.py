@@ -68,6 +68,7 @@ def write_csv(answer: pl.DataFrame, file: Path, guard: bool = True) -> None:
 
 
 def write_parquet(answer: pl.DataFrame, file: Path) -> None:
+    """Write an answer of `balise sql` with its provenance."""
     write_bytes(file, noted_bytes(answer, {"table": "answer of `balise sql`", "software": SOFTWARE}))
 
 

@@ -74,6 +74,7 @@ class _Form(_Strict):
 
 
 def settings_files(configuration: Path | None = None, vehicle: Path | None = None) -> SettingsFiles:
+    """Names, sizes and digests of the settings files that were given."""
     paths = {"configuration": configuration, "vehicle": vehicle}
     return {name: None if path is None else _file(storage.file_digests(path)[0]) for name, path in paths.items()}
 
@@ -192,6 +193,7 @@ def anchor(out: Address) -> tuple[str, int]:
 
 
 def anchor_words(digest: str, runs: int) -> str:
+    """The line that a campaign prints: by it a manifest can be recognised later."""
     return f"{NAME}: sha256 {digest} of {runs} {'run' if runs == 1 else 'runs'}"
 
 

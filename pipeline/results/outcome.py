@@ -65,6 +65,7 @@ class RunOutcome:
 
     @property
     def defect(self) -> bool:
+        """The run failed by a defect of the program."""
         return self.trace is not None
 
 
@@ -90,20 +91,25 @@ class CampaignSummary:
         return dict(verdict_figures(pl.DataFrame(rows, schema=names))) if rows else {}
 
     def count(self, status: RunStatus) -> int:
+        """How many runs ended so."""
         return sum(outcome.status == status for outcome in self.outcomes)
 
     @property
     def all_ok(self) -> bool:
+        """Every planned run is there, and is ok."""
         return self.count(RunStatus.OK) == self.planned
 
     @property
     def skipped(self) -> int:
+        """How many runs were there already."""
         return sum(outcome.skipped for outcome in self.outcomes)
 
     @property
     def defects(self) -> int:
+        """How many runs failed by a defect of the program."""
         return sum(outcome.defect for outcome in self.outcomes)
 
     @property
     def left(self) -> int:
+        """How many planned runs were not reached."""
         return self.planned - len(self.outcomes)

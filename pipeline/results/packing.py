@@ -145,6 +145,7 @@ class _PackWriter:
 
     @property
     def run_ids(self) -> list[str]:
+        """Runs written so far."""
         return [str(row[0]) for row in self._rows]
 
     def add(self, marker: Marker, tables: Mapping[str, pa.Table]) -> None:

@@ -120,6 +120,7 @@ def file_name(part: str, name: str) -> str:
 
 
 def file_digests(pack: Pack) -> dict[str, str]:
+    """SHA-256 of each file of a pack, by file name."""
     return {file_name(part, pack.name): digest for part, digest in pack.sha256.items()}
 
 
@@ -176,6 +177,7 @@ def _read_index(out: str, name: str, digest: str, columns: tuple[str, ...]) -> p
 
 
 def markers(out: Address, runs: Mapping[str, PackedRun]) -> Iterator[Marker]:
+    """The markers of packed runs."""
     for pack, rows in by_pack(runs):
         index = _read_index(str(out), pack.name, pack.sha256[INDEX], ("run_id", *_OF_MARKER))
         yield from (Marker(*row) for row in index[list(rows.values())].iter_rows())
@@ -210,6 +212,7 @@ def steady(read: Callable[[], T]) -> T:
 
 
 def unusable(out: Address, file: str, reason: str) -> UsageError:
+    """The error for a pack that cannot be read, or is gone."""
     kind = UsageError if files.exists(join(out, file)) else GoneError
     return kind(
         f"cannot be read, and many runs are in it: {reason}",

@@ -83,6 +83,7 @@ def write_files(out: Address, run_id: str, contents: Mapping[str, bytes]) -> Non
 
 
 def read_run(out: Address, run_id: str) -> RunTables:
+    """The five tables of one run."""
     frames = {name: read_table(out, name, run_id).drop("run_id").collect() for name in TABLES}
     return RunTables(run_id, **frames)
 
@@ -210,6 +211,7 @@ def run_ids(out: Address) -> list[str]:
 
 
 def own_runs(out: Address) -> list[str]:
+    """Runs with files of their own, sorted."""
     folders = [name for name in storage.folders_in(join(out, _MARKER)) if name.startswith("run_id=")]
     runs = sorted(unquote(name.removeprefix("run_id=")) for name in folders)
     return runs if is_url(out) else _own(out, runs)
@@ -338,4 +340,5 @@ def write_vehicle(out: Address, vehicle: Vehicle) -> None:
 
 
 def folder_name(run_id: str) -> str:
+    """The hive partition of a run."""
     return f"run_id={file_name(run_id)}"

@@ -36,6 +36,7 @@ def with_progress(items: Collection[T]) -> Iterator[T]:
 
 
 def tell(done: int, total: int) -> None:
+    """Report progress to whoever waits for it."""
     if (progress := _PROGRESS.get()) is not None:
         progress(done, total)
 

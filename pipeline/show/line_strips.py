@@ -132,9 +132,11 @@ class _Window:
     top: float
 
     def x(self, at_m: float) -> float:
+        """Where a place is drawn; places outside at the edge."""
         return _LEFT + (min(max(at_m, self.begin_m), self.end_m) - self.begin_m) * self.scale
 
     def holds(self, at_m: float) -> bool:
+        """Whether the strip shows a place."""
         return self.begin_m <= at_m < self.end_m or at_m == self.end_m
 
 

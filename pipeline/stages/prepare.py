@@ -63,6 +63,7 @@ class PreparedRun:
         return self._fixes[solution]
 
     def ranges(self, solution: str) -> pl.DataFrame | None:
+        """Satellites of one solution, or None."""
         satellites = self.run.satellites
         return None if satellites is None else satellites.filter(pl.col("solution") == solution)
 
@@ -90,6 +91,7 @@ class PreparedRun:
 
     @property
     def provenance(self) -> Provenance:
+        """Which inputs and settings the results are made of."""
         return provenance(self.run, self.site, self.vehicle, self.config)
 
     @property

@@ -32,6 +32,7 @@ class Noted:
         self._scratch: list[str] = []
 
     def note(self, place: Address) -> None:
+        """Remember the state of a place that a step reads."""
         if self._around is not None:
             self._around.note(place)
         text = str(place) if is_url(place) else str(Path(place).absolute())

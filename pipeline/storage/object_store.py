@@ -110,9 +110,11 @@ class _PatientStore:
 
     @property
     def silence_s(self) -> float:
+        """For how long nothing has arrived [s]."""
         return time.monotonic() - self._since_s
 
     def arrived(self, *_: object) -> None:
+        """Something has arrived now."""
         self._since_s = time.monotonic()
 
     def __getattr__(self, name: str) -> Any:

@@ -83,6 +83,7 @@ class GroupedWriter:
         )
 
     def add(self, table: pa.Table) -> None:
+        """Take rows; written once they make a row group."""
         self._waiting.append(table)
         self._rows += table.num_rows
         if self._rows >= self._rows_per_group:

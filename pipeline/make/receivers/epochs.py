@@ -93,6 +93,7 @@ class Gathered:
         return 0.0
 
     def drop(self, reason: str, count: int = 1) -> None:
+        """Count records that are left out for a reason."""
         if count:
             self.dropped[reason] = self.dropped.get(reason, 0) + count
 

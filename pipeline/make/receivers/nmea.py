@@ -76,10 +76,12 @@ class Sentences(Gathered):
 
     @property
     def rivals(self) -> frozenset[str]:
+        """Talkers of which each has positions of its own at the same times."""
         return self.talkers.rivals
 
     @property
     def widest_m(self) -> float:
+        """How far apart two talkers are at most [m]."""
         return self.talkers.widest_m
 
 

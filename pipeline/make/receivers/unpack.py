@@ -56,6 +56,7 @@ def _all_logs(log: Path, place: Path, budget: Budget) -> list[Path]:
 
 
 def is_packed(path: Path) -> bool:
+    """Whether a file is an archive, by its suffix."""
     return path.suffix.lower() in _UNPACKERS
 
 

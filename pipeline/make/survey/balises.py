@@ -134,6 +134,7 @@ class _Placer:
         self.everywhere = segments_of(track).search()
 
     def placed(self, row: dict[str, Any]) -> tuple[str, float]:
+        """Net element and measure [m] of a row: as given, by coordinates, or by line kilometre."""
         filled = {key for key, value in row.items() if value is not None}
         if {"netelement_id", "measure_m"} <= filled:
             return str(row["netelement_id"]), float(row["measure_m"])

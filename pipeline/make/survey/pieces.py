@@ -109,6 +109,7 @@ class Survey:
     findings: list[Finding] = field(default_factory=list)
 
     def add(self, other: Survey) -> None:
+        """Take over what another source holds."""
         self.pieces += other.pieces
         self.relations += other.relations
         self.declared_m |= other.declared_m
@@ -117,6 +118,7 @@ class Survey:
         self.findings += other.findings
 
     def report(self, severity: str, place: str, message: str, remedy: str = "") -> None:
+        """Note a finding."""
         self.findings.append(Finding(severity, place, message, remedy))  # type: ignore[arg-type]
 
 

@@ -32,6 +32,7 @@ _GEOID = "# height_m: only a height over the ellipsoid; one over the sea is anot
 
 
 def one_line(text: str) -> str:
+    """The text with every run of white space as one space."""
     return " ".join(text.split())
 
 

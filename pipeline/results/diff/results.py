@@ -59,6 +59,7 @@ class RunDiff:
 
     @property
     def same(self) -> bool:
+        """Nothing differs."""
         return not (self.hazards or self.differences)
 
     @property
@@ -86,6 +87,7 @@ class ResultDiff:
 
     @property
     def same(self) -> bool:
+        """The same runs, and nothing differs in any."""
         return not (self.only_in_a or self.only_in_b or self.runs)
 
     def text(self, detail: bool = False) -> str:

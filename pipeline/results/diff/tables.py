@@ -30,6 +30,7 @@ class Difference:
 
     @property
     def place(self) -> str:
+        """`table.column`, or the table alone."""
         return f"{self.table}.{self.column}" if self.column else self.table
 
     def __str__(self) -> str:

@@ -33,6 +33,7 @@ class CampaignHead:
 
     @property
     def word(self) -> str:
+        """The verdict in one word."""
         return word_of(self.verdict)
 
     def counts(self) -> dict[str, int]:

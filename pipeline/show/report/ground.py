@@ -44,11 +44,13 @@ class _View:
     origin: tuple[float, float]
 
     def at(self, path_m: Floats) -> tuple[Floats, Floats]:
+        """East and north [m] of path positions; without a site the path is drawn straight."""
         if self.site is None:
             return path_m, np.where(np.isfinite(path_m), 0.0, np.nan)
         return plane_m(ground_at(self.site.track, self.stretches, path_m), self.origin)
 
     def gnss(self, epochs: pl.DataFrame) -> tuple[Floats, Floats]:
+        """East and north [m] of the positions themselves, off the track as far as they were."""
         cross_m = floats(epochs, "cross_track_m")
         if self.site is None:
             return floats(epochs, "path_m"), cross_m

@@ -118,6 +118,7 @@ def tiles(rows: Iterable[tuple[str, str, str]]) -> str:
 
 
 def section(identity: str, title: str, *content: str) -> str:
+    """A section of a page with its heading."""
     inner = "\n".join(part for part in content if part)
     return f'<section id="{identity}"><h2>{escape(title)}</h2>\n{inner}\n</section>'
 
@@ -132,6 +133,7 @@ def figure(name: str, title: str, explanation: str = "") -> str:
 
 
 def badge(kind: str, text: str = "") -> str:
+    """A coloured word."""
     return f'<span class="badge {escape(kind)}">{escape(text or kind)}</span>'
 
 

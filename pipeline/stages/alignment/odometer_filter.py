@@ -37,9 +37,11 @@ class Estimates(NamedTuple):
     latency_sigma_s: Floats
 
     def over(self, epochs: int) -> Estimates:
+        """The same at so many epochs."""
         return Estimates(*(np.full(epochs, value) for value in self))
 
     def at(self, rows: Ints) -> Estimates:
+        """At some epochs."""
         return Estimates(*(column[rows] for column in self))
 
     def put(self, begins: Ints, changes: Estimates) -> None:
@@ -156,6 +158,7 @@ class ScaleLatencyFilter:
         return FilterState(joint, t_s, state.origin_m, left_m2 + brought_m2)
 
     def after(self, state: FilterState, joint: Floats, t_s: float) -> FilterState:
+        """The state after an epoch, with what has settled since."""
         return state._replace(joint=joint, t_s=t_s, unsettled_m2=self._unsettled_m2(state, t_s))
 
     def run(self, state: FilterState, t_s: Floats, path_m: Floats, sigma_m: Floats, jitter_s: Floats) -> Floats:

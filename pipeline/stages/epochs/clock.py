@@ -36,6 +36,7 @@ class Clock:
 
     @classmethod
     def of(cls, epochs: pl.DataFrame, config: Configuration) -> Clock:
+        """The clock of an epochs table."""
         return cls.at(times_ns(epochs), position_ns(epochs), config)
 
     @classmethod
@@ -47,6 +48,7 @@ class Clock:
 
     @property
     def duration_s(self) -> float | None:
+        """From the first epoch to the last [s]."""
         return float(self.t_ns[-1] - self.t_ns[0]) / 1e9 if len(self.t_ns) else None
 
 

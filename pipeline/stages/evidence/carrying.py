@@ -52,6 +52,7 @@ class SignedOdometer:
     signed: bool = True
 
     def without_sign(self) -> SignedOdometer:
+        """The same, of a counter that counts up in both directions."""
         return replace(self, signed=False)
 
     @cached_property

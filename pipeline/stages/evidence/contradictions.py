@@ -51,6 +51,7 @@ class KnownPath:
         return replace(self, path=self.path.part(rows), **arrays)
 
     def place(self, sample: int) -> Place:
+        """Net element and measure of one sample."""
         element, measure, _ = self.path.legs[int(self.path.leg[sample])].locate(self.at_m[[sample]])
         return Place(int(element[0]), float(measure[0]))
 
@@ -206,6 +207,7 @@ class Levels:
 
     @classmethod
     def of(cls, steps: Sequence[ReferenceStep], t_ns: Ints, reads_ns: Sequence[int]) -> Levels:
+        """The levels between steps of a reference; reads confirm those that they lie in."""
         lasting, spikes = _without_spikes(steps, t_ns)
         heard = np.searchsorted(t_ns, np.array(reads_ns, dtype=np.int64))
         begins = [(step.sample + 1, step.step_m, step.span is not None) for step in lasting]

@@ -39,6 +39,7 @@ class Alternative:
 
     @property
     def middle_m(self) -> Floats:
+        """Middle of the interval at each instant [m]."""
         return 0.5 * (self.low_m + self.high_m)
 
     def where(self, kept: Bools | Ints | slice) -> Alternative:
@@ -55,6 +56,7 @@ class Alternative:
         return Alternative(self.rows, self.route, self.low_m - slack_m, self.high_m + slack_m)
 
     def widened(self, factor: float) -> Alternative:
+        """With intervals so many times as wide."""
         half_m = 0.5 * factor * (self.high_m - self.low_m)
         return Alternative(self.rows, self.route, self.middle_m - half_m, self.middle_m + half_m)
 

@@ -29,6 +29,7 @@ class GapChain:
 
     @property
     def apart_m(self) -> float:
+        """Distance between its anchors, as the odometer counts up [m]."""
         return self.at_m[-1] - self.at_m[0]
 
 
@@ -47,10 +48,12 @@ class Gap:
 
     @property
     def anchors(self) -> list[TrueAnchor]:
+        """One or two."""
         return [anchor for anchor in (self.begin, self.end) if anchor is not None]
 
     @property
     def closed(self) -> list[GapChain]:
+        """The routes whose length the odometer counted."""
         return [route for route in self.routes or [] if route.closed]
 
     @property

@@ -224,6 +224,7 @@ class Follows:
     at_stands: bool = False
 
     def found(self, config: EvidenceConfig) -> bool:
+        """Whether the odometer is made of the positions."""
         return self.at_stands or (self.ratio is not None and self.ratio < config.follows_limit)
 
 

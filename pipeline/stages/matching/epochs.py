@@ -182,6 +182,7 @@ class Placed:
 
     @classmethod
     def on(cls, fixes: Fixes, path: TravelledPath, assignment: Assignment) -> Placed:
+        """Project every epoch onto its leg."""
         feet = path.feet(fixes.points, assignment.leg, fixes.valid, assignment.near_path_m)
         return cls(feet, *path.places(assignment.leg, feet, fixes.height_m))
 

@@ -161,6 +161,7 @@ class PathCourse:
     place_m: Floats
 
     def place(self, row: int) -> Place:
+        """Where the train was at one of the steps."""
         return Place(int(self.step[row]), int(self.oriented[row]), float(self.place_m[row]))
 
 

@@ -56,6 +56,7 @@ class AxisState:
 
     @classmethod
     def at_restart(cls, alphas: int, sources: int, lasting: int = 0) -> AxisState:
+        """All zero; `lasting`: number of errors that stay."""
         zero = np.zeros(alphas)
         return cls(zero, zero, np.zeros((alphas, sources)), zero, zero, np.zeros((lasting, alphas)))
 

@@ -44,6 +44,7 @@ class NoiseMeter:
         self._entering = [np.arange(samples.row.size) for samples in self._samples]
 
     def freeze(self, row: int) -> None:
+        """No row from this one on enters the noise."""
         for index, samples in enumerate(self._samples):
             entering = self._entering[index]
             self._entering[index] = entering[: np.searchsorted(samples.row[entering], row)]
@@ -196,9 +197,11 @@ class _Triples(NamedTuple):
     oldest: Ints
 
     def where(self, kept: Bools) -> _Triples:
+        """Some of them."""
         return _Triples(*(rows[kept] for rows in self))
 
     def second_difference(self, values: Floats) -> Floats:
+        """x(t) - 2 x(t - L) + x(t - 2 L) of a series."""
         return np.asarray(values[self.last] - 2.0 * values[self.middle] + values[self.oldest])
 
 

@@ -124,6 +124,7 @@ class _Ranges:
 
     @property
     def systems(self) -> int:
+        """How many constellations."""
         return int(self.system.max(initial=-1)) + 1
 
 

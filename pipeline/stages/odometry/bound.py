@@ -254,6 +254,7 @@ class _Sums(NamedTuple):
 
     @classmethod
     def of(cls, t_s: Floats, distance_m: Floats, left_out: Bools) -> _Sums:
+        """Over all steps but those left out."""
         distances, times = (
             np.concatenate([[0.0], np.cumsum(np.where(left_out, 0.0, np.diff(values)))]) for values in (distance_m, t_s)
         )

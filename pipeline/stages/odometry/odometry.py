@@ -92,10 +92,12 @@ class Odometry:
 
     @property
     def begin_ns(self) -> int:
+        """The first row."""
         return self.epoch_ns
 
     @property
     def end_ns(self) -> int:
+        """The last row, rounded up."""
         return self.epoch_ns + int(np.ceil(self.t_s[-1] * 1e9))
 
     def oriented(self, sign: int) -> Odometry:

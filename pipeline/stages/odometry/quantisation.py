@@ -39,6 +39,7 @@ class QuantisationNoise:
     moving_s2: float = 0.0
 
     def variance_m2(self, speed_mps: Floats) -> Floats:
+        """Variance of a row at these speeds."""
         return self.still_m2 + self.moving_s2 * speed_mps**2
 
     def of_counter(self, counter_m: float) -> QuantisationNoise:
@@ -63,6 +64,7 @@ class ScatterPieces(NamedTuple):
     explained_m2: Floats
 
     def take(self, pieces: Ints | slice) -> ScatterPieces:
+        """Some of the pieces."""
         return ScatterPieces(
             self.end[pieces], self.speed_mps[pieces], self.scatter_m2[pieces], self.explained_m2[pieces]
         )
@@ -269,6 +271,7 @@ class KnownNoise:
     shown: Bools
 
     def at(self, samples: Ints) -> KnownNoise:
+        """At some of the samples."""
         return KnownNoise(*(getattr(self, each.name)[samples] for each in fields(self)))
 
     def row_m2(self, speed_mps: Floats) -> Floats:

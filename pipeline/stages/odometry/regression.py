@@ -51,6 +51,7 @@ class ScaleLag:
 
     @property
     def measured(self) -> bool:
+        """Both scale and lag are known."""
         return self.state is LagState.MEASURED
 
 

@@ -50,6 +50,7 @@ class Node:
 
     @property
     def element(self) -> int:
+        """The net element, whatever the orientation."""
         return self.oriented // 2
 
     @property
@@ -86,6 +87,7 @@ class ResidualsBefore:
 
     @cached_property
     def begins(self) -> Ints:
+        """First step of the longest look back of each window."""
         end_s = self._steps.end_s
         return np.asarray(np.searchsorted(end_s, end_s[self.node.begin] - 3.0 * np.array(WINDOWS_S)))
 

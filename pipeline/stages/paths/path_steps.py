@@ -53,6 +53,7 @@ class PathSteps:
 
     @property
     def begin_ns(self) -> Ints:
+        """Instant of the first position of each step."""
         return np.round(self.begin_s * NS_PER_S).astype(np.int64) + self.start_ns
 
     @cached_property
@@ -210,6 +211,7 @@ class Moves:
 
     @classmethod
     def without_odometer(cls, network: Network, steps: PathSteps, config: MatchingConfig) -> Moves:
+        """Moves of which only the positions say how far they are."""
         count = len(steps)
         unknown = np.zeros(len(network.successors), dtype=np.int64)
         return cls(network, steps, np.full(count, np.nan), np.zeros(count), unknown, config)

@@ -81,6 +81,7 @@ class Stretch(NamedTuple):
 
     @classmethod
     def joined(cls, parts: Sequence[Stretch]) -> Stretch:
+        """One after the other."""
         return cls(*(np.concatenate(column) for column in zip(*parts, strict=True)))
 
     def upto(self, count: int) -> Stretch:
@@ -125,6 +126,7 @@ class PathTests:
 
     @classmethod
     def of_run(cls, steps: PathSteps, alone: int, config: MatchingConfig) -> PathTests:
+        """The tests with all that is known of the run without a path: windows, noise along the track."""
         windows = np.array([_windows(steps.end_s, window_s) for window_s in WINDOWS_S])
         late, early_end, early = np.moveaxis(windows, 1, 0)
         measured_m2 = np.full(late.shape, np.nan)

@@ -281,6 +281,7 @@ class Samples:
 
     @property
     def root_m(self) -> Floats:
+        """Sigma of sample and survey together at each place near it [m]."""
         return np.hypot(self.sigma_m[self.near.step], self.survey_m)
 
     def placed(self, factor: float) -> Bools:

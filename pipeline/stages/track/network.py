@@ -114,6 +114,7 @@ class Network:
 
     @cached_property
     def chords(self) -> Chords:
+        """How far its chords lie off their curves."""
         return Chords(self.track, self.successors.here, self.successors.to)
 
     def survey_sigmas_m(self, unstated_m: float, vertex: Ints) -> Floats:
@@ -159,6 +160,7 @@ class Network:
         return len(self.track.ids)
 
     def length_m(self, oriented: int) -> float:
+        """Length of an oriented element [m]."""
         return self._lengths_m[oriented // 2]
 
     @cached_property

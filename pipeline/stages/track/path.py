@@ -48,6 +48,7 @@ class Chain:
 
     @property
     def high(self) -> int:
+        """Number of its last element."""
         return self.low + len(self.oriented) - 1
 
     @property
@@ -128,6 +129,7 @@ class Reach(NamedTuple):
         return self.chain.entry_m[-1]
 
     def after(self, network: Network, edge: Edge) -> Reach:
+        """Carried on over a relation."""
         barred = self.barred_forward + (not edge.forward), self.barred_backward + (not edge.backward)
         return Reach(self.chain.after(network, edge), *barred)
 
@@ -223,6 +225,7 @@ class RoutePath:
 
     @cached_property
     def exit_m(self) -> Floats:
+        """Coordinate at which each element is left [m]."""
         return self.entry_m + self.high_m - self.low_m
 
     def coordinate(self, element: Ints, measure_m: Floats, near_m: Floats) -> tuple[Floats, Ints]:

@@ -37,6 +37,7 @@ class Box:
         return np.flatnonzero(~outside)
 
     def holds(self, other: Box) -> bool:
+        """Whether another box lies within this one."""
         return bool((self.low_m <= other.low_m).all() and (self.high_m >= other.high_m).all())
 
 
@@ -238,10 +239,12 @@ class Leg:
 
     @property
     def start_m(self) -> float:
+        """Path position of its start [m]."""
         return float(self.path_start_m[0])
 
     @property
     def end_m(self) -> float:
+        """Path position of its end [m]."""
         return float(self.path_end_m[-1])
 
     def entry_m(self, number: int) -> float:

@@ -112,6 +112,7 @@ class SurveyedTrack:
         return ints(pairs["_balise"]), ints(pairs["_element"])
 
     def vertices(self, element: int) -> slice:
+        """The vertices of an element."""
         return slice(int(self.first[element]), int(self.first[element + 1]))
 
     def end(self, element: int, position: int) -> int:
@@ -127,6 +128,7 @@ class SurveyedTrack:
         return element if low_m - MEASURE_TOLERANCE_M <= measure_m <= high_m + MEASURE_TOLERANCE_M else None
 
     def elements(self) -> Iterator[tuple[int, str, slice]]:
+        """Number, name and vertices of each element."""
         for element, name in enumerate(self.ids):
             yield element, name, self.vertices(element)
 

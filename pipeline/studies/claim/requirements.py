@@ -85,6 +85,7 @@ class ClaimJourney:
 
     @cached_property
     def speeds(self) -> SpeedErrors:
+        """Errors of the speed, window by window."""
         return speed_errors(self.front, self.profile.method.speed_window_s)
 
     @cached_property
@@ -115,6 +116,7 @@ class Requirement:
 
     @property
     def key(self) -> Key:
+        """Name, and what it applies to."""
         return self.name, self.applies_to
 
 

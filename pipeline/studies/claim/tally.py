@@ -144,6 +144,7 @@ class Demand:
 
     @property
     def words(self) -> str:
+        """The demand as a formula."""
         if self.kind is Kind.ALWAYS:
             return "always"
         return f"< {self.limit:g} /h" if self.kind is Kind.RATE else f"p >= {self.limit:g}"

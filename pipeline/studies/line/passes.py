@@ -50,6 +50,7 @@ class PieceIndex:
 
     @classmethod
     def of(cls, site: Site, pieces: Pieces, middles_m: Floats) -> PieceIndex:
+        """The index over pieces with these middles [m]."""
         return cls(site, pieces, cKDTree(np.nan_to_num(middles_m, nan=1e12)))
 
     def near(self, rows: pl.DataFrame, reach_m: float) -> Ints:

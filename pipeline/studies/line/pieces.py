@@ -37,11 +37,13 @@ class Pieces:
 
     @property
     def middle_m(self) -> Floats:
+        """Measure of the middle of each piece [m]."""
         middle: Floats = 0.5 * (self.from_m + self.to_m)
         return middle
 
     @property
     def names(self) -> list[str]:
+        """Net element of each piece."""
         return [self.track.ids[number] for number in self.element]
 
 

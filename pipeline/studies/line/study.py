@@ -36,6 +36,7 @@ class LineResult:
 
     @property
     def pieces(self) -> pl.DataFrame:
+        """Classes per piece and direction."""
         return self.line.table
 
     @property

@@ -33,6 +33,7 @@ class Cause:
 
     @property
     def words(self) -> str:
+        """The cause as a clause."""
         sentence = MISFIT_PLACES[self.code] if isinstance(self.code, MisfitPlace) else CAUSES[self.code]
         return sentence.format(*self.figures)
 
@@ -60,6 +61,7 @@ class Check:
 
     @property
     def sentence(self) -> str:
+        """The whole comparison as a sentence."""
         return f"{self.what}: {self.found}" + (f" ({self.cause})" if self.causes else "")
 
     @property

@@ -48,6 +48,7 @@ class StreamLag:
 
     @property
     def name(self) -> str:
+        """The stream as people write it."""
         return self.stream.replace("_", " ")
 
 

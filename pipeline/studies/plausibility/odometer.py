@@ -201,6 +201,7 @@ class Arrangement(NamedTuple):
     north: float
 
     def turned(self, velocity: Floats) -> Floats:
+        """Velocities as they should be, (n, 2) east and north."""
         ordered = velocity[:, ::-1] if self.exchanged else velocity
         turned: Floats = ordered * np.array([self.east, self.north])
         return turned
@@ -213,6 +214,7 @@ class Arrangement(NamedTuple):
 
     @property
     def causes(self) -> tuple[Cause, ...]:
+        """What was done to the axes."""
         signs = [name for name, sign in (("east", self.east), ("north", self.north)) if sign < 0]
         exchanged = (Cause(MisfitCause.VELOCITY_EXCHANGED),) if self.exchanged else ()
         return exchanged + ((Cause(MisfitCause.VELOCITY_SIGN, (" and ".join(signs),)),) if signs else ())

@@ -182,10 +182,12 @@ class PairFit:
 
     @property
     def known(self) -> bool:
+        """The scale is known."""
         return not self.reason
 
     @property
     def lag_known(self) -> bool:
+        """The lag is known, to half a second."""
         return self.known and self.lag_sigma_s < _LAG_SIGMA_S
 
     @property

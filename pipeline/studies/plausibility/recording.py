@@ -36,6 +36,7 @@ class Recording:
 
     @cached_property
     def line(self) -> SurveyLine | None:
+        """The survey; None without a site."""
         return None if self.site is None else line_of(self.site)
 
     @cached_property
@@ -55,6 +56,7 @@ class Recording:
         return {name: fit_pair(self.gnss, counter) for name, counter in self.counters.items()}
 
     def seconds(self, frame: pl.DataFrame) -> Floats:
+        """Times of a stream since the epoch of all records [s]."""
         return seconds_since(self.epoch_ns, frame)
 
 

@@ -29,6 +29,7 @@ class LdsModel:
 
     @property
     def mu_per_h(self) -> float:
+        """Rate of detection and negation, 1 / T_D [1/h]."""
         return 1.0 / self.time_to_detect_h
 
 

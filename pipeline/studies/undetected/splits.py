@@ -32,6 +32,7 @@ class _Blocks(NamedTuple):
 
     @classmethod
     def over(cls, rows: int) -> _Blocks:
+        """Blocks over so many rows, each longer than the one before."""
         edges = [0]
         while edges[-1] < rows:
             edges.append(min(edges[-1] + max(1, int(GROWTH * edges[-1])), rows))

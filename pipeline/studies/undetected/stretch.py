@@ -35,6 +35,7 @@ class GrowthStretch:
 
     @property
     def rows(self) -> int:
+        """How many rows."""
         return self.watched.rows
 
     def first(self, rows: int) -> GrowthStretch:
