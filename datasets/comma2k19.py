@@ -69,6 +69,7 @@ def _log(segment: Path, name: str, columns: int) -> tuple[Floats, Floats]:
 
 
 def _array(path: Path, dimensions: int) -> Floats:
+    """An array of a segment, of so many dimensions."""
     try:
         values: Floats = np.load(path)
     except (OSError, ValueError) as error:

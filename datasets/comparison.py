@@ -77,6 +77,7 @@ Pair = tuple[str, str, str]
 
 
 def _hazards(expected: ExpectedRun, found: pl.DataFrame) -> list[Pair]:
+    """Hazards expected, and those found."""
     rows = found.sort("hazard_id").to_dicts()
     pairs = [
         (
@@ -163,6 +164,7 @@ def _merged(pairs: list[Pair]) -> list[Pair]:
 
 
 def _alarms(expected: ExpectedRun, found: pl.DataFrame) -> list[Pair]:
+    """Alarms expected, and those found."""
     pairs = [("alarms", expected.alarms, _one_of(found["verdict"].to_list()))]
     if expected.suspect is not None:
         pairs.append(("suspect", expected.suspect, _one_of(found["suspect"].to_list())))
@@ -170,6 +172,7 @@ def _alarms(expected: ExpectedRun, found: pl.DataFrame) -> list[Pair]:
 
 
 def _scale(expected: ExpectedRun, found: pl.DataFrame) -> list[Pair]:
+    """Scale of the odometer expected, and that found."""
     if expected.odometer_scale is None:
         return []
     text = f"{expected.odometer_scale:g} ± {expected.odometer_scale_tolerance:g}"

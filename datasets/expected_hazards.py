@@ -62,6 +62,7 @@ class _World:
 
 
 def _world(scenario: Scenario, spec: RunSpec, fault: PlacedFault) -> _World:
+    """What of a scenario decides about hazards, without noise."""
     motion = build_motion(spec.motion)
     t_s = np.arange(0.0, motion.duration_s + 1e-9, 1.0 / spec.gnss.rate_hz)
     exact = placed(fault, motion, spec.gnss.rate_hz)
@@ -98,6 +99,7 @@ class _ExpectedRows:
 
 
 def _class_of(ids: frozenset[str]) -> str:
+    """Class of a jump over so many balises."""
     return "VB_JUMP_1A" if len(ids) > 1 else "VB_JUMP_1B"
 
 

@@ -89,12 +89,14 @@ class FaultSpec(Settings):
     @model_validator(mode="before")
     @classmethod
     def _usual_target(cls, data: object) -> object:
+        """A fault without target has the usual one of its kind."""
         if isinstance(data, dict) and "target" not in data:
             return {**data, "target": _usual_target_of(str(data.get("kind")))}
         return data
 
     @model_validator(mode="after")
     def _says_how_much(self) -> Self:
+        """A fault has the one quantity that its kind needs."""
         needed = _NEEDS[self.kind]
         given = [name for name in _QUANTITIES if getattr(self, name) is not None]
         if given != ([needed] if needed else []):
@@ -130,6 +132,7 @@ class PlacedFault(FaultSpec):
 
     @model_validator(mode="after")
     def _begins_and_ends_once(self) -> Self:
+        """A fault has one begin, and at most one end."""
         if (self.at_m is None) == (self.start_s is None):
             raise ValueError("a fault needs either start_s or at_m")
         if self.until_m is not None and self.duration_s is not None:
@@ -283,12 +286,14 @@ def _size(fault: FaultSpec, to_end_s: float) -> float | None:
 
 
 def _usual_target_of(kind: str) -> str:
+    """What a kind of fault usually acts on."""
     if kind in (FaultKind.OUTAGE, FaultKind.LATENCY):
         return "position"
     return "odometer" if kind in _ON_ODOMETER else "along"
 
 
 def _allowed_targets(kind: FaultKind) -> tuple[str, ...]:
+    """What a kind of fault may act on."""
     if kind in _ON_ODOMETER:
         return ("odometer",)
     if kind is FaultKind.OUTAGE:

@@ -119,6 +119,7 @@ def inject(run: RunLog, fault: FaultSpec, site: Site | None = None, whole: Recor
 
 
 def _span_ns(run: RunLog) -> tuple[int, int]:
+    """First and last time of a run [ns]."""
     if run.gnss.is_empty():
         raise InputError("holds no epoch", place=f"{run.run_id}: gnss")
     t_ns = run.gnss["t"].to_physical()
@@ -131,6 +132,7 @@ def _seconds(frame: pl.DataFrame, first_ns: int) -> Floats:
 
 
 def _positions(run: RunLog, fault: FaultSpec, whole: Recording, rng: np.random.Generator) -> pl.DataFrame:
+    """Positions of a run with a fault."""
     parts = []
     for solution in run.gnss["solution"].unique(maintain_order=True):
         part = run.gnss.with_row_index("row").filter(pl.col("solution") == solution)
@@ -143,6 +145,7 @@ def _positions(run: RunLog, fault: FaultSpec, whole: Recording, rng: np.random.G
 def _position_fault(
     fault: FaultSpec, part: pl.DataFrame, solution: str, whole: Recording, rng: np.random.Generator
 ) -> pl.DataFrame:
+    """Positions of one solution with a fault."""
     t_s = _seconds(part, whole.first_ns)
     if fault.kind is FaultKind.OUTAGE:
         return part.filter(pl.Series(~active(fault, t_s)))
@@ -201,6 +204,7 @@ def _odometer(run: RunLog, fault: FaultSpec, first_ns: int) -> pl.DataFrame:
 
 
 def _faulty_sensor(odometer: pl.DataFrame, fault: FaultSpec, first_ns: int) -> pl.DataFrame:
+    """One sensor of the odometer with a fault."""
     t_s = _seconds(odometer, first_ns)
     if fault.kind is FaultKind.OUTAGE:
         return odometer.filter(pl.Series(~active(fault, t_s)))

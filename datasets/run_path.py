@@ -118,6 +118,7 @@ _BEYOND_M = 5000.0
 
 
 def _on_track(track: pl.DataFrame, elements: list[str | None], measures: Floats) -> tuple[Floats, Floats, Floats]:
+    """Places on the track, by net element and measure."""
     names = np.array(elements, dtype=object)
     result = np.full((3, names.size), np.nan)
     for element in dict.fromkeys(elements):
@@ -131,6 +132,7 @@ def _on_track(track: pl.DataFrame, elements: list[str | None], measures: Floats)
 
 
 def _fixes(run: RunLog, solution: str) -> pl.DataFrame:
+    """Positions of one solution, those without fix left out."""
     fixes = run.gnss.filter(
         (pl.col("solution") == solution) & pl.col("latitude_deg").is_not_null() & (pl.col("fix") != "none")
     )

@@ -54,6 +54,7 @@ def breach_messages(error: ValidationError, kind: type[BaseModel]) -> list[str]:
 
 
 def _wrong(breach: ErrorDetails) -> str:
+    """One breach, for people."""
     key = ".".join(map(str, breach["loc"])) or "(file)"
     text = _WORDS.get(breach["type"], breach["msg"].removeprefix("Value error, "))
     found = breach["input"]

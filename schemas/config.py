@@ -94,6 +94,7 @@ class Configuration(Settings):
 
     @model_validator(mode="after")
     def _level_exists(self) -> Self:
+        """The service level of the hazards is one of those of the model."""
         if self.hazards.service_level not in self.safety.service_levels:
             known = ", ".join(sorted(self.safety.service_levels))
             raise ValueError(f"hazards.service_level {self.hazards.service_level!r} is none of {known}")

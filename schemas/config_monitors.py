@@ -243,6 +243,7 @@ class MonitorConfig(Settings):
     @field_validator("ewma_alphas")
     @classmethod
     def _fastest_first(cls, alphas: tuple[float, float, float]) -> tuple[float, float, float]:
+        """Weights of the averages fall."""
         if not alphas[0] > alphas[1] > alphas[2]:
             raise ValueError(f"found {list(alphas)}; expected three falling weights, the fastest average first")
         return alphas
@@ -250,6 +251,7 @@ class MonitorConfig(Settings):
     @field_validator("disabled")
     @classmethod
     def _monitors_exist(cls, names: tuple[str, ...]) -> tuple[str, ...]:
+        """Names are those of monitors."""
         if unknown := [name for name in names if name not in MONITORS]:
             raise ValueError(f"no monitor is called {', '.join(unknown)}; expected some of {', '.join(MONITORS)}")
         return names

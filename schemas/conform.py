@@ -102,11 +102,13 @@ def meanings(schema: type[dy.Schema]) -> dict[str, dict[str, str]]:
 
 
 def _cast(series: pl.Series, dtype: pl.DataType) -> pl.Series:
+    """A series in a type."""
     return series if series.dtype == dtype else series.cast(dtype)
 
 
 @lru_cache(maxsize=64)
 def _names_and_dtypes(schema: type[dy.Schema]) -> tuple[list[str], list[pl.DataType]]:
+    """Names and types of the columns of a schema."""
     return [rule.name for rule in _rules(schema)], [rule.dtype for rule in _rules(schema)]
 
 
@@ -127,6 +129,7 @@ def _rules(schema: type[dy.Schema]) -> tuple[_Rule, ...]:
 
 
 def _bound(column: dy.Column, name: str) -> float | None:
+    """Bound of a column, if it has one."""
     bound = getattr(column, name, None)
     return bound if isinstance(bound, int | float) else None
 

@@ -25,6 +25,7 @@ Times are UTC, nanoseconds, GNSS time of validity. A null means "not known". Flo
 
 
 def _dtype(column: dy.Column) -> str:
+    """Type of a column, for people."""
     if isinstance(column, dy.Enum):
         return "enum " + " ".join(column.categories)
     if isinstance(column, dy.List):
@@ -84,6 +85,7 @@ def settings_frame() -> pl.DataFrame:
 
 
 def _settings_rows(file: str, prefix: str, settings: BaseModel) -> list[tuple[str, str, str]]:
+    """Settings with units and meanings, sections within sections included."""
     rows: list[tuple[str, str, str]] = []
     for name in type(settings).model_fields:
         value = getattr(settings, name)
@@ -112,6 +114,7 @@ def dictionary_markdown() -> str:
 
 
 def _markdown_row(name: str, column: dy.Column) -> str:
+    """A column as a row of a table in Markdown."""
     unit = (column.metadata or {}).get("unit", "")
     nullable = "yes" if column.nullable else ""
     return f"| `{name}` | {_dtype(column)} | {unit} | {nullable} | {column.description or ''} |\n".replace(

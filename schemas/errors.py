@@ -71,6 +71,7 @@ def _rebuild(
     expected: str | None,
     remedy: str | None,
 ) -> BaliseError:
+    """An error, rebuilt in another process."""
     return kind(message, place=place, found=found, expected=expected, remedy=remedy)
 
 

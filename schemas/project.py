@@ -47,6 +47,7 @@ def _possible(path: str) -> str:
 
 
 def _naming(path: str) -> str:
+    """A path that names a run."""
     if Path(path).name in ("", ".."):
         raise ValueError("names no run")
     return path
@@ -180,6 +181,7 @@ class Project(Settings):
 
     @model_validator(mode="after")
     def _consistent(self) -> Self:
+        """What is stated of a project fits together."""
         twice = [run for run, count in Counter(entry.run_id for entry in self.convert).items() if count > 1]
         if twice:
             raise ValueError(f"convert: {', '.join(twice)} stands there twice; results are stored by run id")

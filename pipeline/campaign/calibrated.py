@@ -98,6 +98,7 @@ def _source(job: RunJob) -> _CalibrationRun:
 
 
 def _calibrated(job: RunJob, sources: Sequence[_CalibrationRun]) -> RunJob:
+    """The job with the calibration that other fault-free runs give."""
     from pipeline.studies.calibration.calibrate import calibration_of
 
     observed = [source.observed for source in sources if source.observed is not None]
@@ -116,6 +117,7 @@ def _calibrated(job: RunJob, sources: Sequence[_CalibrationRun]) -> RunJob:
 
 
 def _require_enough(job: RunJob, count: int, refused: str) -> None:
+    """Refuse to calibrate by too few runs."""
     least = job.config.calibration.least_runs
     if count < least:
         raise UsageError(

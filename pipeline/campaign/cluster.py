@@ -103,6 +103,7 @@ class DaskEngine(Engine):
         self._workers[event[1]["key"]] = event[1]["worker"]
 
     def _end(self, task: Any, worker: str) -> None:
+        """End the worker of a run, begin it anew, and give up the run."""
         with contextlib.suppress(Exception):
             self._client.sync(
                 self._client.scheduler.restart_workers,
@@ -116,6 +117,7 @@ class DaskEngine(Engine):
         task.cancel()
 
     def _ask(self, question: Any, **arguments: str) -> Any:
+        """Ask the scheduler, which must answer within a time."""
         return self._client.sync(question, callback_timeout=WAITS.scheduler_answer_s, **arguments)
 
     def _count(self) -> int:

@@ -99,6 +99,7 @@ class _Overdue(StopRun):
 
 @contextlib.contextmanager
 def _alarm(limit_s: float) -> Iterator[None]:
+    """End what runs within this context once it takes too long."""
 
     def ring(signum: int, frame: FrameType | None) -> None:
         raise _Overdue
@@ -162,6 +163,7 @@ class LocalEngine(Engine):
 
 
 def _was_without_memory(result: Result) -> bool:
+    """Whether a run ended because memory ran out."""
     return not result.cancelled() and result.exception() is None and result.result().error == NO_MEMORY
 
 
@@ -208,6 +210,7 @@ class _WorkerSlot:
         self._runs = 0
 
     def _started(self) -> ProcessPoolExecutor:
+        """The executor of the worker's process, begun anew if that process is gone."""
         if self._process is not None and not self._process.is_alive():
             self.kill()
         if self._executor is None:
@@ -258,6 +261,7 @@ def _begin_worker(ground: Path) -> None:
 
 
 def _go_with_parent() -> None:
+    """End a worker process when its parent ends."""
     parent = multiprocessing.parent_process()
     if parent is not None:
         parent.join()

@@ -78,6 +78,7 @@ def run_campaign(
 
 
 def _engine_for(jobs: int, runs: int, scheduler: str | None, limit_s: float) -> Engine:
+    """The engine that suits a number of runs and processes."""
     if scheduler is not None and runs:
         return DaskEngine(scheduler, limit_s)
     return SerialEngine(limit_s) if runs <= 1 and HAS_ALARM else LocalEngine(max(1, min(jobs, runs)))

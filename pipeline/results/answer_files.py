@@ -42,6 +42,7 @@ def write_answer(
 
 
 def _writer_for(file: Path) -> Writer:
+    """What writes a file of this suffix."""
     writers: dict[str, Writer] = {".csv": write_csv, ".parquet": write_parquet, ".xlsx": write_xlsx}
     if file.suffix.lower() not in writers:
         raise UsageError("has an unknown suffix", place=str(file), expected=" or ".join(writers))

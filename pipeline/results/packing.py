@@ -72,6 +72,7 @@ def pack_runs(out: Address, runs_per_pack: int, jobs: int) -> Iterator[tuple[Pac
 
 
 def _take_apart(out: Address, runs_per_pack: int) -> None:
+    """Take packs apart that hold runs replayed since, or are less than half full."""
     listed = packs.listed(out)
     builds = set(_builds(out).values()) if listed else set()
     for pack in listed:
@@ -105,6 +106,7 @@ def _sizes(out: Address, runs: Iterable[str]) -> dict[str, int]:
 
 
 def _portions(runs: Sequence[str], size_of: Mapping[str, int], most: int) -> Iterator[tuple[str, ...]]:
+    """Runs in portions of no more than a size."""
     portion: list[str] = []
     size = 0
     for run in runs:

@@ -60,6 +60,7 @@ class Pack(BaseModel):
 
     @model_validator(mode="after")
     def _of_all(self) -> Self:
+        """A pack has a digest and an end for every table."""
         if self.sha256.keys() != {INDEX, *TABLES} or self.ends.keys() != set(TABLES):
             raise ValueError("not the digests of all files of a pack")
         return self
@@ -99,6 +100,7 @@ def listed(out: Address) -> list[Pack]:
 
 @lru_cache(maxsize=4)
 def _parsed(out: str, content: bytes) -> list[Pack]:
+    """The packs of a list."""
     try:
         return _List.model_validate_json(content).packs
     except ValidationError as error:
@@ -125,6 +127,7 @@ def file_digests(pack: Pack) -> dict[str, str]:
 
 
 def _whole(out: Address, file: str, digest: str) -> bytes:
+    """Content of a file of a pack, which must be there and whole."""
     content = storage.content_of(join(out, file))
     if content is None or sha256(content) != digest:
         raise unusable(out, file, "is missing" if content is None else "is damaged")
@@ -166,6 +169,7 @@ def index_of(out: Address, pack: Pack) -> Index:
 
 @lru_cache(maxsize=256)
 def _index(out: str, name: str, digest: str) -> Index:
+    """Rows of each run within the tables of a pack."""
     rows = _read_index(out, name, digest, tuple(column for column in INDEX_COLUMNS if column not in _OF_MARKER))
     starts = {table: np.concatenate([[0], rows[f"{table}_rows"].cum_sum().to_numpy()]) for table in TABLES}
     return Index(rows["run_id"].to_list(), starts)

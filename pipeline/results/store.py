@@ -193,6 +193,7 @@ def _read_own(
 
 
 def _check_columns(table: str, run_id: str, recorded: Mapping[str, pl.DataType]) -> None:
+    """Refuse a table whose columns are not those of the contract."""
     expected = dtypes(TABLES[table])
     unlike = [name for name, kind in expected.items() if recorded.get(name) != kind]
     if unlike:

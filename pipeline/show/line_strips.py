@@ -86,6 +86,7 @@ def _line_from(
     beyond: Mapping[tuple[str, int], list[tuple[str, int]]],
     taken: set[str],
 ) -> Line:
+    """A line of net elements, from one of its ends on."""
     stretches: list[Stretch] = []
     following: tuple[str, int] | None = (start, entered)
     begin_m = 0.0
@@ -108,6 +109,7 @@ def strips(pieces: pl.DataFrame, links: pl.DataFrame, balises: pl.DataFrame) -> 
 
 
 def _strip(number: int, line: Line, pieces: Mapping[str, pl.DataFrame], balises: Mapping[str, pl.DataFrame]) -> str:
+    """The strip of one line."""
     names = line[0].name if len(line) == 1 else f"{line[0].name} to {line[-1].name}"
     total_m = line[-1].begin_m + line[-1].length_m
     first = pieces[line[0].name].row(0, named=True)
@@ -163,6 +165,7 @@ def _row(
 
 
 def _axis(window: _Window) -> Iterator[str]:
+    """The axis of kilometres."""
     width_km = _WIDTH / window.scale / 1000.0
     step_km = next((step for step in _TICKS_KM if width_km / step <= 12), _TICKS_KM[-1])
     base = window.top + 72
@@ -186,6 +189,7 @@ def _named(stretch: Stretch, window: _Window) -> Iterator[str]:
 
 
 def _balises(balises: pl.DataFrame, stretch: Stretch, window: _Window) -> Iterator[str]:
+    """The balises of a stretch."""
     for at_m, kind in balises.select("measure_m", "kind").iter_rows():
         if window.holds(stretch.at(at_m)):
             sign = "|" if kind == BaliseKind.VIRTUAL.value else "‖"

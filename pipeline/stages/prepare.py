@@ -164,5 +164,6 @@ def require_independent_odometer(prepared: PreparedRun) -> None:
 
 
 def _origin_words(odometry: Odometry) -> str:
+    """Where the odometry comes from, for people."""
     follows = ", but it follows the positions" if odometry.follows_gnss else ""
     return f"{odometry.origin}{follows}"

@@ -76,6 +76,7 @@ def describe_bag(path: Path, config: IngestConfig) -> LogDescription:
 
 
 def _topics_alone(path: Path, config: IngestConfig) -> tuple[TopicSummary, ...]:
+    """Topics of a bag, without its messages if that can be."""
     try:
         if path.is_dir() and (declared := declared_of(path)) is not None and declared.mcap:
             return topics_of(files_of(path, declared), config)
@@ -158,6 +159,7 @@ def _absent(folder: Path, declared: Declared, found: Sequence[Path]) -> Iterator
 
 
 def _undeclared(folder: Path, declared: Declared) -> Iterator[str]:
+    """Files beside a bag that its description does not name."""
     others = sorted(path.name for path in folder.iterdir() if path.suffix in (".mcap", ".db3"))
     known = {name.removesuffix(".zstd") for name in declared.files}
     yield from (f"{name} is not declared, and not read" for name in others if name not in known)
@@ -173,6 +175,7 @@ def _fewer(declared: Declared, counts: Mapping[str, int]) -> Iterator[str]:
 
 
 def _with_rest(run: RunLog, left: dict[str, int]) -> tuple[RunLog, dict[str, int]]:
+    """A run with what was not used of its log."""
     if run.notes.damage is not None:
         left = left | {f"end of the log, {run.notes.damage}": 1}
     return run, left | {f"topic {topic}": 1 for topic in run.notes.skipped_topics}
@@ -216,6 +219,7 @@ def _transcribe(path: Path, to: Path, config: IngestConfig) -> tuple[dict[str, i
 
 
 def _write(bag: Any, to: Path, unpack: Unpack, budget: Budget) -> tuple[dict[str, int], dict[str, int]]:
+    """Write all messages of a bag as MCAP."""
     from mcap.writer import CompressionType, Writer
 
     left: dict[str, int] = {}
@@ -258,6 +262,7 @@ def _without_sequence(known: Any) -> Any:
 
 
 def _definition(types: Any, name: str) -> str | None:
+    """Definition of a message type, if it is known."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         try:

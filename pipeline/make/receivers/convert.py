@@ -282,6 +282,7 @@ def said_of(reason: str) -> str:
 
 
 def _reasons(dropped: Mapping[str, int]) -> str:
+    """What was not used, and why, for people."""
     return "".join(f" Not used: {reason} ({count})." for reason, count in sorted(dropped.items()))
 
 
@@ -345,6 +346,7 @@ def _spans(log: Path, frame: pl.DataFrame, key: str, columns: tuple[str, ...]) -
 
 
 def _convert_one(log: Path, config: IngestConfig, date: date | None, solution: str | None) -> Gatherings:
+    """What one file of a receiver gives."""
     if is_bag(log):
         # Corrections are made of the whole, once.
         own = of_topics(config, log)

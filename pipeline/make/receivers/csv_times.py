@@ -82,6 +82,7 @@ def instants(table: pl.DataFrame, mapping: StreamMapping, path: Path) -> pl.Seri
 def _refuse(
     wrong: pl.Series, values: pl.Series, place: str, message: str, expected: str, remedy: str | None = None
 ) -> None:
+    """Refuse a column with values that are wrong, and show the first of them."""
     if wrong.any():
         row = int(wrong.arg_max() or 0)
         raise InputError(
@@ -227,6 +228,7 @@ def _resolve_repeated_hours(
 
 
 def _offset_ns(zone: pl.Series) -> pl.Series:
+    """Offset of time zones from UTC [ns]."""
     digits = zone.str.replace_all("[A-Z:]", "").str.extract(r"([0-9]{4})").fill_null("0000")
     minutes = digits.str.slice(0, 2).cast(pl.Int64) * 60 + digits.str.slice(2, 2).cast(pl.Int64)
     sign = pl.Series(np.where(zone.str.starts_with("-").fill_null(False).to_numpy(), -1, 1))

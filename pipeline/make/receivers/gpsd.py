@@ -87,10 +87,12 @@ def _objects(content: bytes, gathered: Gathered) -> Iterator[dict[str, Any]]:
 
 
 def _device(found: dict[str, Any]) -> str:
+    """Name of the receiver that a report is of."""
     return str(found.get("device", ""))
 
 
 def _has_fix(found: dict[str, Any]) -> bool:
+    """Whether a report has a position."""
     return _number(found, "mode", 0.0) >= 2 and _number(found, "lat") is not None and _number(found, "lon") is not None
 
 
@@ -135,6 +137,7 @@ def _time_ns(found: dict[str, Any]) -> int | None:
 
 
 def _position(gathered: Gathered, found: dict[str, Any]) -> None:
+    """Put down the position of a report."""
     t_ns = _time_ns(found)
     if t_ns is None:
         gathered.drop("time not valid")
@@ -153,6 +156,7 @@ def _position(gathered: Gathered, found: dict[str, Any]) -> None:
 
 
 def _kind(found: dict[str, Any]) -> Fix:
+    """Kind of fix of a report."""
     if not _has_fix(found):
         return Fix.NONE
     return _STATUS.get(int(_number(found, "status", 0.0)), Fix.AUTONOMOUS)
@@ -196,6 +200,7 @@ def _sky(gathered: Gathered, found: dict[str, Any]) -> None:
 
 
 def _satellite(entry: dict[str, Any]) -> dict[str, Any] | None:
+    """One satellite of a report, if it is complete."""
     name = _name(entry)
     azimuth_deg, elevation_deg = _number(entry, "az"), _number(entry, "el")
     if name is None or azimuth_deg is None or elevation_deg is None or not abs(elevation_deg) <= 90.0:
@@ -211,6 +216,7 @@ def _satellite(entry: dict[str, Any]) -> dict[str, Any] | None:
 
 
 def _name(entry: dict[str, Any]) -> str | None:
+    """Name of a satellite, by its system or its PRN."""
     system, number, prn = (_number(entry, name) for name in ("gnssid", "svid", "PRN"))
     if system is not None and number is not None and int(system) in _SYSTEMS and 0 < number < 256:
         return satellite_name(_SYSTEMS[int(system)], int(number))

@@ -114,6 +114,7 @@ def _belongs(gathered: Sentences, m: Any, raw: bytes) -> bool:
 
 
 def _has_fix(m: Any) -> bool:
+    """Whether a sentence has a position."""
     if m.msgID == "RMC":
         return bool(m.status == "A")
     kind = _FIXES.get(int(m.quality or 0), Fix.NONE) if m.msgID == "GGA" else None
@@ -185,6 +186,7 @@ def _time_ns(day: date, moment: time) -> int:
 
 
 def _date_of(m: Any) -> date | None:
+    """Date of a sentence, if it is one."""
     try:
         return date(int(m.year), int(m.month), int(m.day))
     except ValueError:
@@ -230,6 +232,7 @@ def _motion(epoch: Epoch, m: Any) -> None:
 
 
 def _accuracy(epoch: Epoch, m: Any) -> None:
+    """Covariance of a position from its standard deviations."""
     if all(isinstance(value, float) for value in (m.stdLat, m.stdLong, m.stdAlt)):
         epoch.gnss |= {"cov_ee_m2": m.stdLong**2, "cov_nn_m2": m.stdLat**2, "cov_uu_m2": m.stdAlt**2}
         epoch.gnss |= _correlation(m) | {"cov_eu_m2": 0.0, "cov_nu_m2": 0.0}

@@ -34,12 +34,14 @@ def parse(raw: bytes) -> Any:
 
 @cache
 def _decoder() -> Any:
+    """The decoder of NovAtel's logs."""
     from novatel_edie import oem
 
     return oem.Decoder()
 
 
 def _name(raw: bytes) -> str:
+    """Name of a message, of ASCII or binary form."""
     if raw[:1] in (b"#", b"%"):
         return raw[1:].split(b",")[0].decode().removesuffix("A")
     return NOVATEL_NAMES.get(struct.unpack_from("<H", raw, 4)[0], "")

@@ -104,6 +104,7 @@ def _detours(gathered: Gathered) -> Iterator[tuple[float, float, float]]:
 
 
 def _place(epoch: Epoch) -> tuple[float, float] | None:
+    """Position of an epoch, if it has one."""
     latitude, longitude = epoch.gnss.get("latitude_deg"), epoch.gnss.get("longitude_deg")
     return None if latitude is None or longitude is None else (float(latitude), float(longitude))
 

@@ -43,6 +43,7 @@ def unpacked(log: Path, config: IngestConfig) -> Iterator[list[Path]]:
 
 
 def _all_logs(log: Path, place: Path, budget: Budget) -> list[Path]:
+    """All logs within an archive, archives within it included."""
     try:
         _unpack(log, place, budget)
         return [inner for entry in sorted(place.iterdir()) for inner in _logs(entry, _DEEPEST, budget)]
@@ -61,10 +62,12 @@ def is_packed(path: Path) -> bool:
 
 
 def _unpack(archive: Path, place: Path, budget: Budget) -> None:
+    """Unpack an archive by its suffix."""
     _UNPACKERS[archive.suffix.lower()](archive, place, budget)
 
 
 def _unpack_zip(archive: Path, place: Path, budget: Budget) -> None:
+    """Unpack a zip archive, within the budget."""
     with zipfile.ZipFile(archive) as opened:
         for entry in opened.infolist():
             if not entry.is_dir():
@@ -73,6 +76,7 @@ def _unpack_zip(archive: Path, place: Path, budget: Budget) -> None:
 
 
 def _unpack_tar(archive: Path, place: Path, budget: Budget) -> None:
+    """Unpack a tar archive, within the budget."""
     with tarfile.open(archive, "r:") as opened:
         for entry in opened:
             packed = opened.extractfile(entry) if entry.isreg() else None

@@ -58,6 +58,7 @@ def _direction(away: bool, travel: TravelAlong) -> BaliseDirection:
 
 
 def _typed(place: str, table: pl.DataFrame) -> pl.DataFrame:
+    """A list of balises in the types of a site."""
     breaches: list[str] = []
     typed = typed_table(RawTable(place, table), "balises", breaches)
     if typed is None:
@@ -146,9 +147,11 @@ class _Placer:
         raise self._refusal(row, "has no place", expected=expected)
 
     def _refusal(self, row: dict[str, Any], message: str, **details: str) -> SiteError:
+        """The error for a balise."""
         return SiteError(message, place=f"{self.place}: balise {row['balise_id']}", **details)
 
     def _at_coordinates(self, row: dict[str, Any]) -> tuple[str, float]:
+        """Net element and measure of a balise given by coordinates."""
         point = points_of(np.array([row["latitude_deg"]]), np.array([row["longitude_deg"]]))
         far_m = self.config.balise_beside_m
         near = candidates_of(point, self.ground, self.everywhere, 2 * far_m)
@@ -163,6 +166,7 @@ class _Placer:
         return self.track.ids[ranked[0][1]], ranked[0][2]
 
     def _report_rival(self, row: dict[str, Any], ranked: list[tuple[float, int, float]]) -> None:
+        """Report tracks on which a balise may lie as well."""
         near = [candidate for candidate in ranked[1:] if candidate[0] < ranked[0][0] + self.config.same_track_m]
         nodes = set(self.network.ends[ranked[0][1]].tolist())
         for _, rival, _ in near:
@@ -171,6 +175,7 @@ class _Placer:
                 self.survey.report("warning", f"balises: {row['balise_id']}", text, "Name netelement_id in the list.")
 
     def _at_kilometre(self, row: dict[str, Any]) -> tuple[str, float]:
+        """Net element and measure of a balise given by its kilometre."""
         wanted = row.get("netelement_id")
         km = float(row["line_km"])
         hits = [

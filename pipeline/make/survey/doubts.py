@@ -29,6 +29,7 @@ def doubts(network: SurveyNetwork, config: SurveyConfig, site: SiteConfig) -> li
 
 
 def _heights(elements: list[LinePiece]) -> Iterator[Finding]:
+    """Points without height."""
     flat = [np.isnan(element.height_m).all() for element in elements]
     if all(flat):
         text = "no point has a height: the site is 2-D, and nothing is diagnosed in height"
@@ -44,6 +45,7 @@ def _heights(elements: list[LinePiece]) -> Iterator[Finding]:
 
 
 def _kinks(element: LinePiece, config: SurveyConfig) -> Iterator[Finding]:
+    """Kinks sharper than track can be."""
     steps = np.diff(element.surface, axis=0)
     length = np.linalg.norm(steps, axis=1)
     unit = steps / length[:, None]
@@ -61,6 +63,7 @@ def _kinks(element: LinePiece, config: SurveyConfig) -> Iterator[Finding]:
 
 
 def _kilometres(element: LinePiece, config: SurveyConfig) -> Iterator[Finding]:
+    """Jumps of the kilometres against the length of the track."""
     distance_m = distance_along_m(element.surface)
     known, off_m, jumps = kilometre_spans(element.line_km, distance_m, config)
     if jumps.any():

@@ -123,6 +123,7 @@ def _of_network(place: str, data: bytes, config: SiteConfig) -> Survey:
 
 
 def _require_field(place: str, features: list[Feature], id_field: str | None) -> None:
+    """Refuse an attribute for names that no feature has."""
     if id_field is None or any(id_field in tags for tags, _ in features):
         return
     known = sorted({key for tags, _ in features for key in tags})
@@ -145,6 +146,7 @@ def _feature(item: Any) -> Feature:
 
 
 def _lines(geometry: Mapping[str, Any]) -> Iterator[Any]:
+    """Lines of a geometry."""
     coordinates = geometry.get("coordinates")
     if geometry.get("type") == "LineString":
         yield coordinates
@@ -153,6 +155,7 @@ def _lines(geometry: Mapping[str, Any]) -> Iterator[Any]:
 
 
 def _piece(place: str, name: str, line: Any) -> Any:
+    """A piece of track from the coordinates of a line."""
     if not isinstance(line, list):
         raise SiteError("coordinates are no list", place=place)
     triples = [_numbers(place, point) for point in line]
@@ -161,6 +164,7 @@ def _piece(place: str, name: str, line: Any) -> Any:
 
 
 def _numbers(place: str, point: Any) -> tuple[float, float, float | None]:
+    """Longitude, latitude and height of a point."""
     try:
         return triple(point)
     except ValueError:

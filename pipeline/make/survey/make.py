@@ -116,6 +116,7 @@ def make_site(wish: Wish, vehicle: Vehicle, config: Configuration) -> Site:
 
 
 def _balises(wish: Wish, network: SurveyNetwork, survey: Survey, config: Configuration) -> pl.DataFrame | None:
+    """Balises at a spacing or from a list, whichever is wished."""
     if wish.spacing_m is not None:
         table = balises_every(network, wish.spacing_m, wish.travel)
         return table if table.height else None

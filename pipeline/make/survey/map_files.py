@@ -76,6 +76,7 @@ def _copied(path: Path, data: bytes, config: SurveyConfig) -> Iterator[_Copy]:
 
 
 def _companion(path: Path, ending: str) -> Path:
+    """Another file of the same map, by its ending."""
     return path.with_suffix(ending) if ending.startswith(".") else path.with_name(path.name + ending)
 
 
@@ -105,6 +106,7 @@ def _features(path: Path, layer: str) -> Iterator[Feature]:
 
 
 def _plain(value: Any) -> Any:
+    """A value without its type of numpy."""
     return value.item() if isinstance(value, np.generic) else value
 
 

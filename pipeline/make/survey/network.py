@@ -69,6 +69,7 @@ def make_network(survey: Survey, join_m: float | None, config: SurveyConfig) -> 
 def _linked(
     elements: list[LinePiece], ends: Ints, crossings: set[int], switches: set[int], survey: Survey, config: SurveyConfig
 ) -> SurveyNetwork:
+    """A network with its links between net elements."""
     track = _track_table(elements)
     return SurveyNetwork(elements, ends, _links(track, ends, crossings, switches, survey, config), track)
 
@@ -275,6 +276,7 @@ def _navigable(units: list[Floats], crossing: bool, switch: bool, switch_deg: fl
 
 
 def _report_node(names: list[str], pairs: set[tuple[int, int]], survey: Survey) -> None:
+    """Report net elements at a node from which no train gets on."""
     place = f"links: {', '.join(names)}"
     lonely = [name for arm, name in enumerate(names) if len(names) > 1 and not any(arm in pair for pair in pairs)]
     if lonely:

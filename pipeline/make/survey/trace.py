@@ -43,6 +43,7 @@ def _all_thinned(pieces: list[LinePiece], surveyed: int, shape_m: float) -> list
 
 
 def _places(piece: LinePiece) -> list[tuple[float, float]]:
+    """Latitude and longitude of each point."""
     return list(zip(piece.latitude_deg.tolist(), piece.longitude_deg.tolist(), strict=True))
 
 
@@ -59,6 +60,7 @@ def _moving(piece: LinePiece, config: SurveyConfig) -> Ints:
 
 
 def _gapless(piece: LinePiece, survey: Survey, config: SurveyConfig) -> Iterator[LinePiece]:
+    """Parts of a recorded line between gaps."""
     steps = np.linalg.norm(np.diff(piece.surface, axis=0), axis=1)
     usual_m = float(np.median(steps)) if len(steps) else 0.0
     gaps = np.flatnonzero(steps > max(config.gap_m, config.gap_steps * usual_m))
@@ -180,6 +182,7 @@ def _thinned(piece: LinePiece, held: Bools, shape_m: float) -> LinePiece:
 
 
 def _off_chord_m(places: Floats) -> Floats:
+    """Distance of points from the chord between the first and the last [m]."""
     chord = places[-1] - places[0]
     share = (places - places[0]) @ chord / max(float(chord @ chord), 1e-12)
     foot = places[0] + np.clip(share, 0.0, 1.0)[:, None] * chord

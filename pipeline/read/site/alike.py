@@ -124,6 +124,7 @@ def _ahead(
 
 
 def _judge(reference: _Point, near: _OnChain, far: _OnChain, config: LdsConfig) -> Finding | None:
+    """A warning if the expectation windows of two balises on a chain overlap."""
     (expected, distance_m) = near
     (later, later_m) = far
     close_m = window_m(distance_m, expected.accuracy_m, reference.accuracy_m, config).close_m

@@ -240,6 +240,7 @@ def _check_kinks(
 
 
 def _check_heights(track: SurveyedTrack, collected: Remarks) -> None:
+    """Refuse sites of which only some net elements have heights."""
     # An element has all heights or none.
     flat = [track.ids[element] for element in np.flatnonzero(np.isnan(track.height_m[track.first[:-1]])).tolist()]
     if flat and len(flat) < len(track.ids):
@@ -359,6 +360,7 @@ def _nearly_met(places: Floats, inward: Floats, free: np.ndarray, config: SiteCo
 
 
 def _check_balises(track: SurveyedTrack, balises: pl.DataFrame, collected: Remarks) -> None:
+    """Refuse balises that a site cannot have."""
     repeated = balises.filter(pl.col("balise_id").is_duplicated())["balise_id"].unique().sort().to_list()
     if repeated:
         collected.breaches.append(f"balises: column balise_id: {', '.join(repeated[:3])} occur more than once")

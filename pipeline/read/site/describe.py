@@ -82,6 +82,7 @@ def elements_table(site: Site) -> pl.DataFrame:
 
 
 def _dimensions(track: SurveyedTrack) -> str:
+    """Whether a site has heights, for people."""
     flat = [bool(np.isnan(track.height_m[part]).any()) for _, _, part in track.elements()]
     if all(flat):
         return "2-D"

@@ -59,6 +59,7 @@ def neighbours(site: Site, config: Configuration) -> pl.DataFrame:
 
 
 def _smoothed(apart_m: Floats) -> Floats:
+    """Distances, smoothed by a running median."""
     if apart_m.size < _PLACES:
         return apart_m
     padded = np.pad(apart_m, _PLACES // 2, mode="edge")

@@ -133,12 +133,14 @@ def _digest(files: dict[str, bytes]) -> str:
 
 
 def _refusal(path: Path | str, breaches: list[str]) -> SiteError:
+    """The error for a site with all that is wrong with it."""
     remedy = "Correct what is named; `balise dictionary` lists the columns of a site."
     remedy = f"Correct what is named. {_MAKE_A_SITE}" if is_geojson(path) else remedy
     return SiteError(listed(breaches), place=shown(path), remedy=remedy)
 
 
 def _load(files: dict[str, bytes], table: str, breaches: list[str]) -> RawTable | None:
+    """A table of a site, if there is a file of it."""
     name = next((name for name in files if name.startswith(f"{table}.")), None)
     return None if name is None else load_table(name, files[name], breaches)
 
@@ -206,6 +208,7 @@ def to_wgs84(raw: RawTable, frame: pl.DataFrame, config: SiteConfig, breaches: l
 
 
 def _transformed(raw: RawTable, frame: pl.DataFrame, config: SiteConfig, breaches: list[str]) -> pl.DataFrame:
+    """A table with coordinates in degrees, of projected ones."""
     import pyproj
 
     try:

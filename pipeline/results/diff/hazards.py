@@ -34,6 +34,7 @@ class HazardChange:
 
     @property
     def _deciding(self) -> list[str]:
+        """Differences in columns that decide about a hazard."""
         return [item.column for item in self.differences if item.column in _DECIDING]
 
     @property
@@ -43,6 +44,7 @@ class HazardChange:
 
     @property
     def _head(self) -> str:
+        """Which hazard it is, and how it changed, for people."""
         return f"{self.hazard} at {self.t_hazard} ({self.solution}) {self.change}"
 
     @property

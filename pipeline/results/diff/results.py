@@ -104,6 +104,7 @@ class ResultDiff:
         return "\n".join(lines)
 
     def _sentence(self) -> str:
+        """How many runs were compared, and how many changed, for people."""
         verdict = "all the same" if not self.runs else f"{len(self.runs)} changed"
         alone = [f"{len(runs)} only in {name}" for runs, name in ((self.only_in_a, "A"), (self.only_in_b, "B")) if runs]
         return ", ".join([f"{self.compared} runs in both: {verdict}", *alone])
@@ -165,6 +166,7 @@ def _section(title: str, rows: list[tuple[str, str]], detail: bool) -> list[str]
 
 
 def _diff_run(out_a: Address, out_b: Address, run_id: str, rules: Rules) -> RunDiff:
+    """What differs between two results of one run."""
     hazards: list[HazardChange] = []
     differences: list[Difference] = []
     verdicts: tuple[str, ...] = ()
@@ -254,6 +256,7 @@ def _recorded(out: Address, table: str, run_id: str) -> bytes | pl.DataFrame:
 
 
 def _frame(out: Address, table: str, run_id: str, recorded: bytes | pl.DataFrame) -> pl.DataFrame:
+    """A table of a run, in whatever form it was recorded."""
     try:
         return read_parquet(recorded) if isinstance(recorded, bytes) else recorded
     except ParquetError as error:
@@ -261,5 +264,6 @@ def _frame(out: Address, table: str, run_id: str, recorded: bytes | pl.DataFrame
 
 
 def _unreadable(out: Address, table: str, run_id: str, reason: str) -> UsageError:
+    """The error for a table that cannot be read."""
     place = redacted(str(store.table_address(out, table, run_id)))
     return UsageError(reason, place=place, remedy="Replay the run again with --force.")

@@ -128,6 +128,7 @@ def _values_differ(a: pl.Series, b: pl.Series, tolerance: float) -> tuple[str, i
 
 
 def _text(value: object) -> str:
+    """A value for people."""
     if value is None:
         return "null"
     if isinstance(value, pl.Series):

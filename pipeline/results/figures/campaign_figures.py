@@ -183,6 +183,7 @@ def failures_of(runs: pl.DataFrame) -> pl.DataFrame:
 
 
 def _quantiles(values: pl.Expr, name: str) -> dict[str, pl.Expr]:
+    """Median and 95th percentile."""
     return {
         f"{name}_median_s": values.median(),
         f"{name}_p95_s": values.quantile(0.95, interpolation="linear"),

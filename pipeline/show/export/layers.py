@@ -31,6 +31,7 @@ def layers_of(tables: RunTables, site: Site) -> dict[str, pl.DataFrame]:
 
 
 def _with_geometry(frame: pl.DataFrame, run_id: str, site: Site) -> pl.DataFrame:
+    """A table with the point of each row, as well-known binary."""
     measure_m = frame["measure_m"].fill_null(float("nan")).to_numpy()
     ground = ground_of(site.track, frame["netelement_id"], measure_m)
     points = np.zeros(frame.height, _WKB_POINT)

@@ -102,6 +102,7 @@ def band(t_ms: Ints, codes: Ints, hold_ms: int, gap_code: int, pieces: int = 300
 
 
 def _merge_equal(starts: Ints, codes: Ints) -> tuple[Ints, Ints]:
+    """Neighbouring pieces of one state made one."""
     first = np.flatnonzero(np.diff(codes, prepend=-1))
     return starts[first], codes[first]
 

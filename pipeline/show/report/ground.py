@@ -193,10 +193,12 @@ def _step_m(extents: pl.DataFrame) -> float:
 
 
 def _piece_m(measure_m: pl.Expr, step_m: float) -> pl.Expr:
+    """Begin of the piece that a measure lies in [m]."""
     return (measure_m / step_m).floor() * step_m
 
 
 def _of_length(pieces: pl.DataFrame, step_m: float) -> pl.DataFrame:
+    """Pieces with their ends."""
     return pieces.with_columns(to_m=pl.col("from_m") + step_m).sort(_PLACE)
 
 

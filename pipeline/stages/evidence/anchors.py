@@ -132,6 +132,7 @@ class KnownStretch:
         return [self._part(slice(first, last + 1)) for first, last in spans_of(~self.doubtful) if last > first]
 
     def _part(self, rows: slice) -> KnownStretch:
+        """The same stretch, with some of its rows only."""
         return replace(
             self,
             t_ns=self.t_ns[rows],

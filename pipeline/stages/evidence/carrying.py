@@ -57,6 +57,7 @@ class SignedOdometer:
 
     @cached_property
     def _breaks_ns(self) -> Ints:
+        """Instants at which an odometer without sign may have changed its sense."""
         return np.zeros(0, dtype=np.int64) if self.signed else _stands_ns(self.odometer)
 
     @property

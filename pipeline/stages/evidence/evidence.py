@@ -180,6 +180,7 @@ class TrainEvidence:
         return either([self._by_clock(t_ns, early_s) for early_s in self.true_clocks_s])
 
     def _by_clock(self, t_ns: Ints, early_s: float) -> EvidenceSet:
+        """Where the train may be, widened by what it moves within an uncertainty of the clock."""
         at_ns, beyond_m = t_ns, np.zeros(t_ns.size)
         if early_s and self.carried:
             at_ns, beyond_m = self.carried[0].counter.within(t_ns - round(early_s * NS_PER_S), abs(early_s))
@@ -190,6 +191,7 @@ class TrainEvidence:
         return replace(found, alternatives=widened) if slack_m.any() else found
 
     def _at(self, t_ns: Ints) -> EvidenceSet:
+        """Where the train may be at instants, as the clock of the evidence stamps them."""
         instants = _Instants(t_ns)
         kind = np.full(t_ns.size, NOTHING)
         proves, on_survey = np.zeros((2, t_ns.size), dtype=np.bool_)
@@ -399,10 +401,12 @@ class _Instants:
 
     @cached_property
     def _order(self) -> Ints:
+        """Rows in order of time."""
         return np.argsort(self.t_ns, kind="stable")
 
     @cached_property
     def _sorted_ns(self) -> Ints:
+        """Instants in order of time."""
         return self.t_ns[self._order]
 
     def within(self, first_ns: int, last_ns: int) -> Ints:

@@ -259,6 +259,7 @@ class GapSearch:
         return min(falls_m) > self.config.lds.odometer_fixed_m
 
     def _branches(self, chain: Chain) -> bool:
+        """Whether the track branches on a chain, in either direction."""
         sides = (side for oriented in chain.oriented for side in (oriented, oriented ^ 1))
         return any(len(self.network.successors[side]) > 1 for side in sides)
 

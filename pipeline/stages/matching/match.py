@@ -141,6 +141,7 @@ def off_the_network(fixes: Fixes, track: SurveyedTrack, config: MatchingConfig) 
 
 
 def _length(metres: float) -> str:
+    """A length for people, in km from 10 km on."""
     return f"{metres / 1000:.0f} km" if metres >= 10_000 else f"{metres:.0f} m"
 
 

@@ -113,6 +113,7 @@ def _match_reasons(epochs: AlignedEpochs) -> Ints:
 
 
 def _along(epochs: AlignedEpochs, t_s: Floats, reasons: Ints, config: Configuration) -> AxisSeries:
+    """The epochs that are compared along the track, and what they are compared by."""
     rows = np.flatnonzero(reasons == NO_REASON)
     at_rows = AlongEpochs(
         epoch=rows,
@@ -382,6 +383,7 @@ class MonitorBank:
         self._along[part] = self._axes[0].state[part, 0] != NOT_EVALUATED
 
     def _look_to_the_end(self) -> None:
+        """Look at all epochs given so far."""
         self._look(self._count - 1)
 
     def failed(self, epoch: int) -> bool:

@@ -297,6 +297,7 @@ def _lags_s(period_s: float, memories_s: Floats) -> list[float]:
 
 
 def _ratio(part: Floats, whole: Floats) -> Floats:
+    """A part of a whole; 0 where the whole is 0."""
     return np.divide(part, whole, out=np.zeros_like(part), where=whole > 0.0)
 
 

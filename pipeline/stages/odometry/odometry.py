@@ -147,6 +147,7 @@ class Odometry:
         return still
 
     def _still_m(self, begin_ns: Ints | int, end_ns: Ints) -> Floats:
+        """What a wheel may move unnoticed in a time, below the speed that counts as standstill [m]."""
         return np.asarray(self.deadband_mps * np.abs(end_ns - begin_ns) / NS_PER_S)
 
     def between(self, begin_ns: Ints | int, end_ns: Ints) -> OdometerDistance:
@@ -284,6 +285,7 @@ class Odometry:
         return index.clip(0, self.t_s.size - 1)
 
     def _slips_between(self, before: Ints, after: Ints) -> Bools:
+        """Whether a wheel slipped at either of two rows."""
         slips: Bools = self.slip[before] | self.slip[after]
         return slips
 
@@ -305,6 +307,7 @@ class Odometry:
 
     @cached_property
     def _travelled_m(self) -> Floats:
+        """Distance travelled at each row, whichever way the train went [m]."""
         width_m = self.hysteresis_m(self.t_s)
         return travelled_m(self.t_s, self.distance_m, width_m, self.deadband_mps, self.config.speed_window_s)
 

@@ -180,6 +180,7 @@ class _Speeds(NamedTuple):
 
 
 def _speeds(pieces: ScatterPieces, config: AlignConfig) -> _Speeds:
+    """Which pieces are faster than the median, and whether both halves differ enough to tell."""
     fast: Bools = pieces.speed_mps > median(pieces.speed_mps)
     low_mps, high_mps = (median(pieces.speed_mps[part]) if part.any() else 0.0 for part in (~fast, fast))
     differ = bool(fast.sum() >= _FEWEST_PIECES) and high_mps**2 >= config.quantisation_factor * low_mps**2

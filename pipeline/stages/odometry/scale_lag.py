@@ -93,6 +93,7 @@ class CounterRows:
 
     @cached_property
     def _half_s(self) -> float:
+        """Half of the time a speed is taken over [s]."""
         return max(_SPEED_S, median(np.diff(self.t_s)))
 
     def speeds(self, t_s: Floats) -> tuple[Floats, Floats]:
@@ -267,8 +268,7 @@ class _DistancePairs:
 
     def _apart_m(self, lag_s: Floats) -> tuple[Floats, Floats]:
         """How far movements that do not overlap are apart at each lag (lags, movements), at the scale that makes their
-        sum least;
-        these scales.
+        sum least; these scales.
         """
         some = slice(None, None, self.step)
         begin_s, end_s, moved_m = (values[some] for values in (self.begin_s, self.end_s, self.moved_m))
@@ -278,6 +278,7 @@ class _DistancePairs:
 
     @cached_property
     def _search(self) -> tuple[Floats, Floats]:
+        """How far movements are apart at each lag tried [m], and the scale at each."""
         return self._apart_m(_LAGS_S)
 
     @cached_property

@@ -106,6 +106,7 @@ class Candidates:
 
     @cached_property
     def _by_element(self) -> tuple[Ints, Ints]:
+        """Candidates in order of net element and step, and where each net element begins."""
         order = np.lexsort((self.step, self.element))
         most = int(self.element.max(initial=-1))
         return order, np.searchsorted(self.element[order], np.arange(most + 2))

@@ -254,9 +254,11 @@ class ReturnSearch:
         return stays
 
     def _root_m(self, left: Left, size: int) -> Floats:
+        """Uncertainty of the last steps, position and survey together [m]."""
         return np.hypot(self.steps.sigma_m[-size:], left.survey_m)
 
     def _moved_m(self, left: Left, size: int) -> Floats:
+        """By more than so much two means a while apart differ on no path, for the last steps [m]."""
         return self.tests.moved_m(self.steps.sigma_m[-size:], np.full(size, left.survey_m))
 
     def _windows_m(self, line: set[int], left: Left, window: int) -> Floats:
@@ -283,6 +285,7 @@ class ReturnSearch:
         return onward + [{*ahead, *_turned(line)} for line in self._choices(left.oriented ^ 1, left.died)]
 
     def _choices(self, oriented: int, died: int) -> list[list[int]]:
+        """Chains of net elements from one on, over elements near the steps since a path died."""
         near = set(np.unique(self.candidates.element[self.candidates.first[died] :]).tolist())
         lines: list[list[int]] = []
         waiting = [[oriented]]
@@ -304,4 +307,5 @@ class ReturnSearch:
 
 
 def _turned(line: list[int]) -> list[int]:
+    """The same chain, run in the opposite direction."""
     return [one ^ 1 for one in line]

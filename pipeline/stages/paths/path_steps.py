@@ -284,6 +284,7 @@ class Moves:
         return (reach.chain for reach in islice(found, 1, None) if reach.chain.oriented[-1] == last)
 
     def _allowed(self, chain: Chain, sense: int) -> Iterator[Edge]:
+        """Edges that may be run over after a chain, in one sense."""
         onward = self.network.successors[chain.oriented[-1]]
         return (edge for edge in onward if (edge.forward if sense > 0 else edge.backward))
 
@@ -296,8 +297,10 @@ class Moves:
 
     @cached_property
     def _at_m(self) -> list[float]:
+        """Counted distance at each step, as a list [m]."""
         return [float(value) for value in self.counted_m]
 
     @cached_property
     def _doubts_m(self) -> list[float]:
+        """Uncertainty of the counted distance at each step, as a list [m]."""
         return [float(value) for value in self.doubt_m]

@@ -286,6 +286,7 @@ def offset_resolution_m(survey_m: Floats, alpha: float, bias_m: float) -> Floats
 
 
 def _size(alpha: float, looks: float) -> float:
+    """Size of one look of a test whose looks together have the size alpha."""
     return float(_sizes(alpha, np.array([looks]))[0])
 
 
@@ -322,6 +323,7 @@ def _limits_and_needed(alpha: float, looks: float) -> tuple[Floats, Floats]:
 
 
 def _tails(sigmas: Floats) -> Floats:
+    """Probability of a standard normal value above so many sigmas."""
     from scipy.special import ndtr
 
     return np.asarray(ndtr(-sigmas))

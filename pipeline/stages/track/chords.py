@@ -54,6 +54,7 @@ class Chords:
 
     @cached_property
     def _known_m(self) -> Floats:
+        """Projections worked out so far, by vertex; not a number where none is yet [m]."""
         return np.full(len(self.track.measure_m), np.nan)
 
     @cached_property

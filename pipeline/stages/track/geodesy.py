@@ -106,6 +106,7 @@ def sines(latitude_deg: Floats, longitude_deg: Floats) -> tuple[Floats, Floats, 
 
 
 def _ecef(sin_lat: Floats, cos_lat: Floats, sin_lon: Floats, cos_lon: Floats, height_m: Floats) -> Floats:
+    """Earth-fixed coordinates of geodetic ones, on the ellipsoid of WGS 84 [m]."""
     normal_m = SEMI_MAJOR_AXIS_M / np.sqrt(1.0 - ECCENTRICITY_SQUARED * sin_lat * sin_lat)
     ring_m = (normal_m + height_m) * cos_lat
     up_m = (normal_m * (1.0 - ECCENTRICITY_SQUARED) + height_m) * sin_lat

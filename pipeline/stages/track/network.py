@@ -131,6 +131,7 @@ class Network:
         return float(np.hypot(stated_m, self.chords.most_m))
 
     def _stated_m(self, vertex: Ints, unstated_m: float) -> Floats:
+        """Survey uncertainty of vertices, or another where the survey states none [m]."""
         stated_m = self.track.sigma_m[vertex]
         return np.where(np.isfinite(stated_m), stated_m, unstated_m)
 
@@ -165,6 +166,7 @@ class Network:
 
     @cached_property
     def _lengths_m(self) -> list[float]:
+        """Length of each net element, as a list [m]."""
         lengths_m: list[float] = self.track.length_m.tolist()  # searches ask for one at a time
         return lengths_m
 

@@ -63,6 +63,7 @@ def read_areas(path: Path | str, site: Site) -> pl.DataFrame | None:
 
 
 def _breaches(file: str, areas: pl.DataFrame, site: Site) -> list[str]:
+    """What is wrong with a file of areas: unknown net elements, overlaps."""
     known = set(site.track["netelement_id"])
     ordered = areas.sort("netelement_id", "from_m", maintain_order=True)
     breaches = [

@@ -101,6 +101,7 @@ def _tallies_of(
     areas: pl.DataFrame | None,
     ahead_m: float,
 ) -> Tallies:
+    """What one run counts for each requirement and area."""
     of_run = (store.read_table(out, name, run["run_id"]).collect() for name in ("epochs", "passages"))
     epochs, passages = (frame.filter(pl.col("solution") == run["solution"]) for frame in of_run)
     front = front_of(epochs, passages, run, config, profile.method, areas, ahead_m)
@@ -130,6 +131,7 @@ def claim_table(by_solution: dict[str, Tallies], profile: RequirementProfile) ->
 
 
 def _row(solution: str, requirement: Requirement, counts: Tally) -> dict[str, Any]:
+    """One requirement of one solution, as a row of the result."""
     shown = requirement.demand.shown(counts)
     return {
         "solution": solution,

@@ -246,6 +246,7 @@ def _balises(line: LineEvidence, name: str, placed: pl.DataFrame) -> pl.DataFram
 def _figures(
     line: LineEvidence, name: str, spacing_m: float, mode: str, placed: pl.DataFrame, growing: Bools
 ) -> dict[str, object]:
+    """The figures of one proposal, as a row of the result."""
     virtual = placed.filter("virtual")
     sides = [(piece, bool(growing[piece]) == ahead, ahead) for piece in virtual["piece"] for ahead in MODES[mode]]
     schema = {"piece": pl.Int64, "growing": pl.Boolean, "ahead": pl.Boolean}

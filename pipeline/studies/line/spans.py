@@ -60,6 +60,7 @@ def states_of(epochs: pl.DataFrame, alarm_starts: pl.Series, config: Configurati
 
 
 def _is(epochs: pl.DataFrame, judgement: str) -> Bools:
+    """Which epochs have a judgement."""
     return (epochs["judgement"].cast(pl.String) == judgement).fill_null(value=False).to_numpy()
 
 

@@ -141,6 +141,7 @@ def _undetected(passages: pl.DataFrame, pieces: Pieces) -> pl.DataFrame:
 
 
 def _known_points(points: pl.DataFrame | None, pieces: Pieces) -> pl.DataFrame:
+    """The points given, which must lie on net elements of the site."""
     if points is None:
         return pl.DataFrame(schema=POINT_COLUMNS)
     if strange := sorted(set(points["netelement_id"]) - set(pieces.track.index)):

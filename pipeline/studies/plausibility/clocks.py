@@ -122,6 +122,7 @@ def _leap_of_gnss(of: Recording, lags: list[StreamLag]) -> int | None:
 
 
 def _of_leap(of: Recording, lag: StreamLag, leap_s: int) -> Check:
+    """The check of a stream that is off by the leap seconds."""
     later = "later" if lag.lag_s > 0 else "earlier"
     found = f"{lag.lag_s:+.2f} s, stamps of the {lag.name} are {later}"
     causes = (Cause(MisfitCause.LEAP_SECONDS, (f"{abs(leap_s)}",)), Cause(MisfitPlace.IN_STREAM, ("GNSS", lag.name)))
@@ -130,6 +131,7 @@ def _of_leap(of: Recording, lag: StreamLag, leap_s: int) -> Check:
 
 
 def _check(of: Recording, lag: StreamLag, of_gnss: StreamLag | None, known: bool) -> Check:
+    """Whether the clock of a stream agrees with that of the GNSS."""
     config = of.config
     what = f"clock of the {lag.name} against the GNSS"
     size_s = abs(lag.lag_s)

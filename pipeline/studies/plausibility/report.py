@@ -163,6 +163,7 @@ def refuted(checks: list[Check]) -> bool:
 
 
 def _check(what: str, sigma_m: Floats, epochs: pl.DataFrame, counted: Bools, config: Configuration) -> Iterator[Check]:
+    """Whether a reported uncertainty agrees with the errors found."""
     low_m, high_m = floats(epochs, "error_low_m"), floats(epochs, "error_high_m")
     # What it leaves possible is the worst; healthy evidence strays by a part of that.
     strays_m = config.evidence.sigma_evidence_part * 0.5 * (high_m - low_m)

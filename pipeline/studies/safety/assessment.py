@@ -156,4 +156,5 @@ def source_files(out: Address) -> pl.DataFrame:
 
 
 def _row(kind: str, of: str, file: dict[str, Any]) -> tuple[str, str, str, int, str]:
+    """A file that the assessment rests on, as a row."""
     return kind, of, file["name"], file["bytes"], file["sha256"]

@@ -104,6 +104,7 @@ def markov_table(config: SafetyConfig) -> pl.DataFrame:
 
 
 def _markov_row(level: str, model: LdsModel, t_h: float, thr_per_h: float) -> dict[str, object]:
+    """The model of one service level, solved in closed form and numerically."""
     state = exact(model, t_h)
     solved = numeric(model, t_h)
     difference = max(abs(a - b) for a, b in zip(astuple(state), astuple(solved), strict=True))

@@ -103,6 +103,7 @@ def _moving_s(epochs: pl.DataFrame) -> float | None:
 def _solution(
     name: str, epochs: pl.DataFrame, hazards: pl.DataFrame, alarms: pl.DataFrame, runs: pl.DataFrame
 ) -> SolutionTables:
+    """The tables of one solution."""
     of_solution = pl.col("solution") == name
     evidence = runs.filter(of_solution)["evidence"].cast(pl.String).to_list()
     return SolutionTables(

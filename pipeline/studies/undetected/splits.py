@@ -90,6 +90,7 @@ class _MonitorCost(NamedTuple):
 
 
 def _raw(stretch: GrowthStretch, blocks: _Blocks) -> _MonitorCost:
+    """What the monitor of raw differences costs a fault, split between both ends of each block."""
     raw_mps = np.maximum(np.abs(stretch.watched.most_mps), np.abs(stretch.watched.least_mps))
     raw_m = np.add.reduceat(stretch.watched.gain_s * _tested(raw_mps), blocks.first)
     single = blocks.first == blocks.last
@@ -98,6 +99,7 @@ def _raw(stretch: GrowthStretch, blocks: _Blocks) -> _MonitorCost:
 
 
 def _average(stretch: GrowthStretch, blocks: _Blocks, average: int) -> _MonitorCost:
+    """What the monitor of one average costs a fault."""
     weight = stretch.watched.weight[:, average]
     part = stretch.watched.gain_s / weight
     # What a row gives to the average, its row before has to pay for in part; the last row has none after it.
@@ -127,6 +129,7 @@ def _paid_at(blocks: _Blocks, threshold: Floats) -> tuple[Ints, Floats]:
 
 
 def _tested(threshold: Floats) -> Floats:
+    """Thresholds, with a price out of reach where nothing is tested."""
     tested = np.isfinite(threshold)
     if tested.all():
         return threshold
