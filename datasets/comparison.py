@@ -37,7 +37,7 @@ class ComparisonRow:
 
 
 def compare(spec: RunSpec, run: RunLog, tables: RunTables) -> list[ComparisonRow]:
-    """Each expectation of a run against its tables, its verdict first: hazards, onset, balises, alarms, scale."""
+    """Compare a run's expectations with its tables: verdict, hazards, onset, balises, alarms, scale."""
     if spec.expected is None:
         raise ConfigError("does not say what has to be found", place=f"scenario: run {spec.id}")
     injected = describe_faults(run.faults)

@@ -70,7 +70,7 @@ class DemoResult:
         return pl.DataFrame(rows, schema=dict.fromkeys(names, pl.String), orient="row")
 
     def as_dict(self) -> dict[str, object]:
-        """For programs; `checks` holds what was expected and found in full."""
+        """The demonstration for programs; `checks` holds what was expected and found in full."""
         verdicts = {"verdict": self.head.word, "verdicts": self.head.counts()}
         return {**verdicts, "page": self.page, "agrees": self.agrees, "checks": self.checks}
 
@@ -116,7 +116,7 @@ def demo(out: Path, seed: int | None = None, progress: Progress | None = None, j
 
 
 def _replay_trial(scenario: Scenario, out: Path, progress: Progress | None, jobs: int) -> None:
-    """As `balise run` would: the trial is a project, some of whose runs have no vehicle file."""
+    """Replay a trial as `balise run` would: as a project, some of whose runs have no vehicle file."""
     bare = {spec.id: NO_VEHICLE for spec in scenario.runs if not spec.vehicle}
     named = {"vehicle": "vehicle.toml", "vehicles": bare} if scenario.vehicle else {}
     project = {"site": "site", "out": "tables", **named, "replay": {"runs": ["runs/*"]}}

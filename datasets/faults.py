@@ -199,7 +199,7 @@ def read_profile(path: str) -> tuple[Floats, Floats]:
 
 
 def active(fault: FaultSpec, t_s: Floats) -> Bools:
-    """From the start of the fault on, its end excluded."""
+    """Whether a fault is active, from its start on, its end excluded."""
     t_ns = np.round(t_s * NS_PER_S)
     begin_ns = round(fault.begins_s() * NS_PER_S)
     end_ns = np.inf if fault.duration_s is None else begin_ns + round(fault.duration_s * NS_PER_S)

@@ -74,7 +74,7 @@ def _left_of(driven: DrivenPath, s_m: Floats) -> tuple[Floats, Floats]:
 
 
 def _own_path(run: RunLog, solution: str) -> DrivenPath:
-    """From the run's own positions, by odometer distance where recorded, else by the distance between positions."""
+    """The path of the run's own positions, by odometer distance where recorded, else by that between positions."""
     fixes = _fixes(run, solution)
     t_ns = fixes["t"].to_physical().to_numpy()
     places = [fixes[name].to_numpy().astype(np.float64) for name in ("latitude_deg", "longitude_deg", "height_m")]
@@ -92,7 +92,7 @@ def _own_path(run: RunLog, solution: str) -> DrivenPath:
 
 
 def _site_path(run: RunLog, solution: str, site: Site) -> DrivenPath:
-    """From the site: every epoch of the run, and what lies beyond, at its place on the matched path."""
+    """The path by the site: every epoch of the run, and what lies beyond, at its place on the matched path."""
     prepared = prepare(run, site, Vehicle(), Configuration())
     fixes = prepared.fixes(solution)
     found = prepared.match(solution)

@@ -71,7 +71,7 @@ def replay(run: RunLog, site: Site, vehicle: Vehicle | None = None, config: Conf
 
 
 def monitor_alone(run: RunLog, site: Site, vehicle: Vehicle, config: Configuration, solution: str) -> MonitoredSolution:
-    """What the train made of one solution, without a judge: for studies of what the monitors could have seen.
+    """What the train made of one solution, without a judge: for studies of what monitors could detect.
 
     Args:
         run: the run as `read_run` yields it.

@@ -77,7 +77,7 @@ class LogEntry(Settings):
     balise_reads: tuple[LogMapping, ...] = ()
 
     def mappings(self) -> dict[str, tuple[StreamMapping, ...]]:
-        """By stream, each with the topic that it is for: of tables the name of the file."""
+        """Mappings by stream, each with the topic that it is for: of tables the name of the file."""
         names = [Path(file).name for file in self.files]
         return {
             stream: tuple(

@@ -54,7 +54,7 @@ class DaskEngine(Engine):
         return max(1, 2 * self._threads)
 
     def lonely_s(self) -> float:
-        """For how long there has been no worker [s]."""
+        """Time for which there has been no worker [s]."""
         return 0.0 if self._threads else time.monotonic() - self._seen_s
 
     def submit(self, job: RunJob) -> Result:

@@ -62,11 +62,11 @@ class Engine:
         return False
 
     def lonely_s(self) -> float:
-        """For how long there has been no worker to hand runs to [s]."""
+        """Time for which there has been no worker to hand runs to [s]."""
         return 0.0
 
     def collected(self, result: Result) -> None:
-        """The campaign has seen the result and is done with it."""
+        """Forget a run whose result the campaign has taken."""
 
     def close(self) -> None:
         """End whatever is still under way, at once."""

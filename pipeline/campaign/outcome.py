@@ -78,7 +78,7 @@ def failure_of(error: BaseException, lasting: bool) -> RunFailure:
 
 
 def _lacks_memory(error: BaseException | None) -> bool:
-    """Also where a library could not be loaded for want of it."""
+    """Whether memory ran out; also where a library could not be loaded for want of it."""
     while error is not None:
         without = isinstance(error, OSError) and error.errno == errno.ENOMEM
         unloaded = isinstance(error, ImportError) and ("map segment" in str(error) or "allocate" in str(error))
@@ -126,7 +126,7 @@ def outcome_of(
 
 
 def _figures_of_verdict(runs: pl.DataFrame, verdict: RunVerdict | None, low: float) -> dict[str, Any]:
-    """What stands beside the verdict, of the solution that heads the run; nothing where all failed."""
+    """Figures next to the verdict, of the solution that heads the run; nothing where all failed."""
     if verdict is None:
         return {}
     row = runs.filter(pl.col("verdict").cast(pl.String) == verdict.value).row(0, named=True)

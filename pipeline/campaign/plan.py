@@ -202,7 +202,7 @@ def _check_name(run_id: str, address: Address) -> None:
 
 
 def _expand(name: str) -> list[Address]:
-    """What cannot be told from a run by its name is taken for one: whether it can be read is found out later."""
+    """Logs at a place; what its name does not show to be no run is taken for one until it is read."""
     matches = storage.require_match(name)
     return [
         run for match in matches for run in ([match] if is_run(match) or not files.is_dir(match) else _runs_in(match))

@@ -62,7 +62,7 @@ def keep_in_place(out: str, known: Mapping[str, RunOutcome]) -> None:
 
 
 def keep(plan: Plan, outcomes: Iterable[RunOutcome]) -> None:
-    """Keep what can be proved, beside what is known of runs that this call did not name."""
+    """Keep what can be proved, with what is known of runs that this call did not name."""
     if is_url(plan.out):
         return
     named = {job.run_id for job in plan.jobs}

@@ -60,7 +60,7 @@ class InspectedLog:
 
     @property
     def start(self) -> datetime:
-        """Of the positions, else of all streams."""
+        """Begin of the positions, else of all streams."""
         return min(span.start for span in self._spans())
 
     @property
@@ -125,7 +125,7 @@ def _run(path: Path, config: IngestConfig) -> InspectedLog:
 
 
 def _parts_of_folder(path: Path, run: RunLog) -> tuple[LogPart, ...]:
-    """The columns and files of a run's folder that are none of the contract's, beside those that are."""
+    """The columns and files of a run's folder that are none of the contract's, and those that are."""
     used = [(name, frame.height) for name in STREAMS if (frame := run.stream(name)) is not None]
     whole = [LogPart(path.name, "file", f"{name}.parquet", rows, name) for name, rows in used]
     return (*whole, *(LogPart(path.name, "file", name, 0) for name in run.notes.skipped_topics))

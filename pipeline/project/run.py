@@ -59,7 +59,7 @@ class Ended:
     unread: Sequence[str] = ()
 
     def lost(self, file: Path) -> list[str]:
-        """These logs in words, for whoever reads the verdict."""
+        """A sentence on each log that could not be read, for whoever reads the verdict."""
         return [
             f"NOT REPLAYED: {log} could not be read, and no figure knows of it. Mend it and name it in a [[convert]] "
             f"table; then, or where it is no log, take it out of `unread` in {file}."
@@ -133,7 +133,7 @@ def plan_of(opened: Opened) -> Plan:
 
 
 def _with_vehicles(plan: Plan, opened: Opened) -> Plan:
-    """Each run with the vehicle file that the project names for it."""
+    """Runs, each with the vehicle file that the project names for it."""
     files = {job.run_id: opened.vehicle_of(job.run_id) for job in plan.jobs}
     vehicles = {file: load_settings(file, Vehicle) for file in set(files.values())}
     digests = {file: digest_of(plan.config, vehicle) for file, vehicle in vehicles.items()}
@@ -145,7 +145,7 @@ def _with_vehicles(plan: Plan, opened: Opened) -> Plan:
 
 
 def _convert(steps: _Steps) -> None:
-    """Every run of logs; all that fail are told at once."""
+    """Convert every run of logs; all that fail are reported at once."""
     entries = steps.opened.project.convert
     config = steps.opened.given_config()
     failures: list[InputError] = []

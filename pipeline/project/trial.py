@@ -188,7 +188,7 @@ def _looked_at(
 
 
 def _named_logs(wanted: Wanted) -> dict[Path, tuple[Path, bool]]:
-    """By its place each log as it was named, or lies in a folder; and whether it is an error that it cannot be read."""
+    """Each log by its place, as named or found in a folder; and whether one that cannot be read is an error."""
     surveys = {path.absolute() for path in wanted.track} | {Path(wanted.balises or "").absolute()}
     named: dict[Path, tuple[Path, bool]] = {}
     for raw in [*_expanded(wanted.raws), *_expanded(wanted.references)]:

@@ -35,7 +35,7 @@ def read_rows(
     columns: Sequence[str],
     check: Callable[[str, ColumnTypes], object],
 ) -> Iterator[tuple[dict[str, int], pl.DataFrame]]:
-    """These columns of one table, pack by pack: how many rows each run has, and the rows, one run after the other.
+    """Columns of one table, pack by pack: how many rows each run has, and the rows, one run after the other.
 
     `check`, given a run, may refuse the columns that there are. Raises `UsageError` for a file that cannot be read.
     """

@@ -108,7 +108,7 @@ def _parsed(out: str, content: bytes) -> list[Pack]:
 
 
 def write_list(out: Address, packs: Sequence[Pack]) -> None:
-    """From now on these packs count."""
+    """Write the list of packs: from now on these count."""
     if not packs:
         storage.remove(join(out, LIST))
         return
@@ -135,7 +135,7 @@ def _whole(out: Address, file: str, digest: str) -> bytes:
 
 
 def find(out: Address, among: Iterable[str] | None = None) -> dict[str, PackedRun]:
-    """Those of these runs that are packed; of all runs in the order of their ids."""
+    """The packed ones of these runs; of all runs in the order of their ids."""
     packs = listed(out)
     if not packs:
         return {}
@@ -146,7 +146,7 @@ def find(out: Address, among: Iterable[str] | None = None) -> dict[str, PackedRu
 
 @lru_cache(maxsize=4)
 def _places(out: str, packs: tuple[tuple[str, str], ...]) -> dict[str, tuple[int, int]]:
-    """By run the number of the last pack that has it, and the row there."""
+    """Number of the last pack that has each run, and the row there."""
     return {
         run_id: (number, row)
         for number, (name, digest) in enumerate(packs)

@@ -133,7 +133,7 @@ def ground_at(track: pl.DataFrame, stretches: pl.DataFrame, path_m: Floats, marg
 
 
 def sign_of(epochs: pl.DataFrame, stretches: pl.DataFrame) -> Floats:
-    """Per epoch +1 where its path grows with the measure, -1 against it, NaN where that is not known."""
+    """+1 at epochs whose path grows with the measure, -1 against it, NaN where that is not known."""
     rows = epochs.select("netelement_id", "measure_m", "path_m").with_row_index("row")
     fitting = (
         rows.join(stretches, on="netelement_id", how="left", maintain_order="left")
@@ -159,7 +159,7 @@ def origin_of(site: Site) -> tuple[float, float]:
 
 
 def element_lines_m(site: Site) -> Iterator[tuple[str, Floats, Floats]]:
-    """Each net element as a line east and north of the origin [m], of no more points than a screen shows."""
+    """Lines of the net elements east and north of the origin [m], of no more points than a screen shows."""
     survey = track_of(site.track)
     nothing = np.full(len(survey.latitude_deg), np.nan)
     east, north = plane_m(GroundPositions(survey.latitude_deg, survey.longitude_deg, nothing, nothing), origin_of(site))

@@ -143,7 +143,7 @@ def _asked(runs: Sequence[str], predicate: pl.Expr | None) -> list[str]:
 
 
 def tables_of(out: Address, table: str, runs: Sequence[str], columns: Sequence[str] | None = None) -> pl.DataFrame:
-    """These columns (all) of one table of these runs, read now. Raises `UsageError` as `scan_runs`."""
+    """Columns (all) of one table of these runs, read now. Raises `UsageError` as `scan_runs`."""
     wanted = ["run_id", *dtypes(TABLES[table])] if columns is None else columns
     if not runs:
         return pl.DataFrame(schema={"run_id": pl.String(), **dtypes(TABLES[table])}).select(wanted)
@@ -169,7 +169,7 @@ def _in_order(runs: Sequence[str], heights: Mapping[str, int], parts: Sequence[p
 def _read_own(
     out: Address, table: str, runs: Sequence[str], columns: Sequence[str]
 ) -> Iterator[tuple[dict[str, int], pl.DataFrame]]:
-    """From the runs' own files: how many rows each run has, and the rows; nothing without runs."""
+    """Rows from the runs' own files, and how many each run has; nothing without runs."""
     run = ""
 
     def checked(recorded: Mapping[str, pl.DataType]) -> Sequence[str]:
@@ -219,12 +219,12 @@ def own_runs(out: Address) -> list[str]:
 
 
 def _own(out: Address, among: Iterable[str]) -> list[str]:
-    """Those of these runs that have files of their own."""
+    """The runs of these that have files of their own."""
     return [run for run in among if exists(table_address(out, _MARKER, run))]
 
 
 def packed(out: Address, among: Iterable[str]) -> dict[str, packs.PackedRun]:
-    """Those of these runs that are read from packs, in order."""
+    """The runs of these that are read from packs, in order."""
     places = packs.find(out, among)
     # A store lists all of them as fast as it answers for a few.
     own = set(own_runs(out) if is_url(out) and len(places) > 1 else _own(out, places))

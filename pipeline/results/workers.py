@@ -52,7 +52,7 @@ def watched(progress: Callable[[int, int], None] | None) -> Iterator[None]:
 
 
 def each(function: Callable[[T], R], tasks: Sequence[T], jobs: int) -> Iterator[R]:
-    """As `mapped`, one result after the other as soon as it and those before it are there."""
+    """Results as of `mapped`, one after the other as soon as it and those before it are there."""
     workers = min(jobs, len(tasks))
     if workers <= 1:
         yield from map(function, tasks)

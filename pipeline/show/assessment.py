@@ -64,7 +64,7 @@ def for_reading(tables: dict[str, pl.DataFrame]) -> dict[str, pl.DataFrame]:
 
 
 def figures_for_reading(figures: pl.DataFrame) -> dict[str, pl.DataFrame]:
-    """Per solution: `figure, value, low, high, unit, source`; low and high are exact two-sided 95 % bounds."""
+    """Figures per solution: `figure, value, low, high, unit, source`; bounds are exact, two-sided, 95 %."""
     return {str(row["solution"]): _figures(row) for row in figures.iter_rows(named=True)}
 
 

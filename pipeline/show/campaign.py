@@ -45,7 +45,7 @@ def summary_line(summary: CampaignSummary) -> str:
 
 
 def ending_rows(summary: CampaignSummary) -> pl.DataFrame:
-    """What a person reads when a campaign has ended, the worst run first: verdict, figures beside it, why, faults."""
+    """What a person reads when a campaign has ended, the worst run first: verdict, figures, why, faults."""
     ranked = sorted(summary.outcomes, key=lambda outcome: (_WORST_FIRST[word_of(outcome.verdict)], outcome.run_id))
     names = ("verdict", "run_id", "accepted", "available", "margin", "why", "faults")
     rows = [
@@ -65,7 +65,7 @@ def _outcome_figures(outcome: RunOutcome) -> tuple[str, str, str]:
 
 
 def remedy_lines(summary: CampaignSummary, **places: str) -> list[str]:
-    """Per remedy how many runs it would mend, and the command for the worst of them; what gains most time first.
+    """How many runs each remedy would mend, and the command for the worst; what gains most time first.
 
     `places`: paths as the user named them.
     """

@@ -150,7 +150,7 @@ def _key() -> str:
 
 
 def _strips(result: LineResult, passed: pl.DataFrame) -> list[str]:
-    """Of all net elements that were passed, with the balises of the first proposal."""
+    """Strips of all net elements that were passed, with the balises of the first proposal."""
     if passed.is_empty():
         return ['<p class="none">Nothing is drawn: no run says anything of any piece.</p>']
     pieces = result.pieces.filter(pl.col("netelement_id").is_in(passed["netelement_id"].unique().implode()))

@@ -68,7 +68,7 @@ def lines_of(lengths_m: Mapping[str, float], links: pl.DataFrame) -> list[Line]:
 
 
 def _neighbours(lengths_m: Mapping[str, float], links: pl.DataFrame) -> dict[tuple[str, int], list[tuple[str, int]]]:
-    """Per end of a net element the ends that it is linked to, in the order of the survey."""
+    """Ends that each end of a net element is linked to, in the order of the survey."""
     usable = links.filter(pl.col("navigability").cast(pl.String) != Navigability.NONE.value)
     beyond: dict[tuple[str, int], list[tuple[str, int]]] = {}
     for a, end_a, b, end_b in usable.select("netelement_a", "position_a", "netelement_b", "position_b").iter_rows():

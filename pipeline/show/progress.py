@@ -32,7 +32,7 @@ class CampaignWatch:
     """Counts the runs of a campaign, and shows those that are not ok and what somebody should see to."""
 
     def begin(self, runs: int, out: str) -> None:
-        """So many runs are to be replayed into `out`."""
+        """Say that so many runs are to be replayed into `out`."""
         self.total = runs
         self.done = self.failed = self.skipped = 0
         self.since_s = time.monotonic()
@@ -80,7 +80,7 @@ class CampaignWatch:
         return ", ".join([f"{self.done}/{self.total} runs", *self.parts(under_way)])
 
     def parts(self, under_way: UnderWay = ()) -> list[str]:
-        """What is said beside how many are done, what matters most first."""
+        """What is said with how many are done, what matters most first."""
         parts = [f"{self.failed} failed or partial"]
         if self.skipped:
             parts.append(f"{self.skipped} skipped")

@@ -96,7 +96,7 @@ class PreparedRun:
 
     @property
     def figures_from(self) -> VehicleFigures:
-        """Where scale and latency come from (DOMAIN section 5.4)."""
+        """Origin of scale and latency, for people (DOMAIN section 5.4)."""
         if self.odometry is None:
             return VehicleFigures.NONE
         in_file = self.vehicle.odometer_scale is not None and self.vehicle.gnss_latency_s is not None

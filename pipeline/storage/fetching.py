@@ -254,7 +254,7 @@ def _fetched(store: Any, path: str, folder: Path, version: str | None) -> Path:
 
 
 def _copies(listing: Listing, path: str, target: Path) -> dict[str, Path]:
-    """Where the object goes, or each of those in the folder."""
+    """Places that the object goes to, or each of those in the folder."""
     if path in listing:
         return {path: target}
     target.mkdir()

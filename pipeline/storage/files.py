@@ -69,7 +69,7 @@ class _Parts(io.RawIOBase):
         self._at = 0
 
     def readable(self) -> bool:
-        """As of every file that is read."""
+        """Whether it can be read, as every file that is read."""
         return True
 
     def seekable(self) -> bool:

@@ -46,7 +46,7 @@ class Noted:
         self._scratch.append(f"{folder.absolute()}{os.sep}")
 
     def digests(self) -> dict[str, str]:
-        """By place what it held when it was read; `NO_DIGEST` where that is not known."""
+        """Digest of each place's content when it was read; `NO_DIGEST` where that is not known."""
         return {
             place: digest_now(place) if state == _state(place) else NO_DIGEST for place, state in self._states.items()
         }

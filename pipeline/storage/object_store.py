@@ -110,7 +110,7 @@ class _PatientStore:
 
     @property
     def silence_s(self) -> float:
-        """For how long nothing has arrived [s]."""
+        """Time for which nothing has arrived [s]."""
         return time.monotonic() - self._since_s
 
     def arrived(self, *_: object) -> None:

@@ -159,7 +159,7 @@ def _absent(folder: Path, declared: Declared, found: Sequence[Path]) -> Iterator
 
 
 def _undeclared(folder: Path, declared: Declared) -> Iterator[str]:
-    """Files beside a bag that its description does not name."""
+    """Files next to a bag that its description does not name."""
     others = sorted(path.name for path in folder.iterdir() if path.suffix in (".mcap", ".db3"))
     known = {name.removesuffix(".zstd") for name in declared.files}
     yield from (f"{name} is not declared, and not read" for name in others if name not in known)

@@ -44,7 +44,7 @@ class Converted:
     parts: tuple[LogPart, ...] = ()
 
     def made_of(self, logs: Sequence[FileDigest]) -> Converted:
-        """The run with the logs that were read for it, beside those that it was made of before."""
+        """The run with the logs that were read for it, and those that it was made of before."""
         listed = dict.fromkeys([*self.run.notes.raw_logs, *((log.name, log.size_bytes, log.sha256) for log in logs)])
         return replace(self, run=replace(self.run, notes=replace(self.run.notes, raw_logs=tuple(listed))))
 
@@ -151,7 +151,7 @@ def extended(
 def _refuse_unlike(
     one: Sequence[StreamCorrection], other: Sequence[StreamCorrection], stream: Stream, place: Path
 ) -> None:
-    """Rows of one stream that were corrected in different ways could not be told apart."""
+    """Refuse rows of one stream that were corrected in different ways: nothing would distinguish them."""
     if one != other:
         changes = [", ".join(made.changes for made in held) or "none" for held in (one, other)]
         raise InputError(
@@ -179,7 +179,7 @@ class Gatherings:
     topics: tuple[str, ...] = ()
 
     def corrections_as(self, purpose: Purpose) -> tuple[StreamCorrection, ...]:
-        """Those of the streams as they are meant: positions that become the reference are no stream `gnss` any more."""
+        """Corrections of the streams as they are meant: positions that become the reference are no `gnss` any more."""
         lost = BY_SOLUTION if purpose.stream == "reference" else ()
         return tuple(made for made in self.corrections if made.stream not in lost)
 
@@ -336,7 +336,7 @@ def _refuse_overlaps(parts: list[tuple[Path, Gatherings]]) -> None:
 
 
 def _spans(log: Path, frame: pl.DataFrame, key: str, columns: tuple[str, ...]) -> Iterator[pl.DataFrame]:
-    """From when to when a log holds values, by recorder; a frame for each of the columns."""
+    """Times from when to when a log holds values, by recorder; a frame for each of the columns."""
     named = frame if key in frame.columns else frame.with_columns(pl.lit("primary").alias(key))
     for column in columns or ("t",):
         if column in named.columns:

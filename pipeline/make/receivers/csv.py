@@ -168,6 +168,6 @@ def _typed(recorded: pl.Series, source: Source, path: Path) -> pl.Series:
 
 
 def _not_nan(expression: pl.Expr, fields: pl.DataFrame) -> pl.Expr:
-    """In a text, NaN is how programs write that they have no value."""
+    """The values without NaN: in a text that is how programs write that they have no value."""
     is_float = fields.lazy().select(expression.alias("value")).collect_schema()["value"].is_float()
     return expression.fill_nan(None) if is_float else expression

@@ -163,7 +163,7 @@ def _kind(found: dict[str, Any]) -> Fix:
 
 
 def _height_m(found: dict[str, Any]) -> float | None:
-    """Over the ellipsoid; `alt` of old logs is over the geoid or the ellipsoid, which nobody says."""
+    """Height over the ellipsoid [m]; `alt` of old logs is over the geoid or the ellipsoid, which nobody says."""
     if _number(found, "mode", 0.0) < 3:
         return None
     if (height_m := _number(found, "altHAE")) is not None:
@@ -173,7 +173,7 @@ def _height_m(found: dict[str, Any]) -> float | None:
 
 
 def _velocity(found: dict[str, Any]) -> dict[str, float]:
-    """By axes where they are told, else by speed [m/s] and course [deg from true north]."""
+    """Velocity by axes where reported, else by speed [m/s] and course [deg from true north]."""
     axes = [_number(found, name) for name in ("velE", "velN", "velD")]
     if None not in axes:
         return velocity(axes[0], axes[1], -axes[2])

@@ -86,7 +86,7 @@ class Sentences(Gathered):
 
 
 def _datum(m: Any) -> str:
-    """Of DTM: its code, where positions are not those of WGS 84."""
+    """Code of the datum by DTM, where positions are not those of WGS 84."""
     code = str(m.datum).strip().upper()
     shifted = any(isinstance(value, float | int) and value for value in (m.latOfset, m.lonOfset))
     return "" if code in ("", "W84") and not shifted else code or "999"
@@ -152,7 +152,7 @@ def settle_days(gathered: Gathered, first_day: date | None = None) -> None:
 
 
 def _turned_dates(epochs: list[Epoch]) -> int:
-    """Put dates that turn beside midnight on the day of their neighbours; how many.
+    """Put dates that turn near midnight on the day of their neighbours; how many.
 
     Seen by time that goes back by a day within one step: so does no clock. The dates are wrong until time goes on by a
     day within one step, or from such a step before on.

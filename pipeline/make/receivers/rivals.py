@@ -92,7 +92,7 @@ def sees_twins(gathered: Gathered) -> float | None:
 
 
 def _detours(gathered: Gathered) -> Iterator[tuple[float, float, float]]:
-    """Of each pair of one time: how far apart, and the way over the second to the next, less the straight one [m]."""
+    """Distance of each pair of one time, and how far the path over the second is longer than the straight one [m]."""
     for one, two in gathered.twins:
         first, second = _place(one), _place(two)
         later = gathered.epochs[two.number + 1 : two.number + 4]
@@ -110,7 +110,7 @@ def _place(epoch: Epoch) -> tuple[float, float] | None:
 
 
 def two_receivers(place: str, names: frozenset[str], apart_m: float, option: str = "talker") -> InputError:
-    """What to do about a log of two receivers; `names`: those by which they can be told apart."""
+    """What to do about a log of two receivers; `names`: those that distinguish them."""
     talkers = " and ".join(sorted(names))
     choose = ", ".join(f"--solution {name}" for name in sorted(names))
     return InputError(

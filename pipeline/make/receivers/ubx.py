@@ -136,7 +136,7 @@ def _protection(m: Any) -> Columns:
 
 
 def _satellites(m: Any, count: int, residual_m: float) -> list[Columns]:
-    """Those that are known and above or below a horizon [deg]; `residual_m`: the unit of the residual."""
+    """Satellites known and above or below a horizon [deg]; `residual_m`: the unit of the residual."""
     rows: list[Columns] = []
     for index in range(1, count + 1):
         azimuth, elevation, residual, used = (

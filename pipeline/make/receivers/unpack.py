@@ -87,7 +87,7 @@ def _unpack_tar(archive: Path, place: Path, budget: Budget) -> None:
 
 
 def _unpack_one(opener: Callable[[Path], Any]) -> Callable[[Path, Path, Budget], None]:
-    """Of a format that packs a single file, which is called as the archive without its last suffix."""
+    """Unpack a format of one single file, which is called as the archive without its last suffix."""
 
     def unpack(archive: Path, place: Path, budget: Budget) -> None:
         name = archive.stem + (".tar" if archive.suffix.lower() == ".tgz" else "")

@@ -33,7 +33,7 @@ Feature = tuple[dict[str, Any], Mapping[str, Any]]
 
 
 def read_geojson(place: str, stem: str, data: bytes, config: SiteConfig, id_field: str | None = None) -> Survey:
-    """Each LineString a piece, named by its own id. Where features have a `railway`, only those in use are taken.
+    """Read each LineString as a piece named by its own id; of features with `railway` only those in use.
 
     A network that gives net relations (RailTopoModel, ERA RINF) is taken as it is, Overpass JSON like GeoJSON.
     `id_field`: property that names the lines. Raises `SiteError`.

@@ -31,7 +31,7 @@ _POINT, _LINE_STRING, _MULTI_LINE_STRING = 1, 2, 5
 
 
 def read_map(path: Path, data: bytes, config: SurveyConfig, id_field: str | None = None) -> Survey:
-    """Each line of each layer a piece, in WGS 84, named by `id_field` if given. Raises `SiteError`."""
+    """Read each line of each layer as a piece in WGS 84, named by `id_field` if given. Raises `SiteError`."""
     try:
         import pyogrio
     except ImportError:

@@ -107,7 +107,7 @@ def _nodes(pieces: list[LinePiece], join_m: float, relations: list[Relation]) ->
 
 
 def _near_ends(surface: Floats, piece_of: Ints, ends: Ints, join_m: float) -> Iterator[tuple[int, int]]:
-    """Each end with the nearest vertex of another piece within reach, or with an end of its own (a ring)."""
+    """The nearest vertex of another piece within reach of each end, or an end of its own (a ring)."""
     tree = cKDTree(surface)
     at_end = np.zeros(len(surface), dtype=bool)
     at_end[ends] = True
@@ -119,7 +119,7 @@ def _near_ends(surface: Floats, piece_of: Ints, ends: Ints, join_m: float) -> It
 
 
 def _without_doubles(pieces: list[LinePiece], nodes: list[Ints], survey: Survey) -> tuple[list[LinePiece], list[Ints]]:
-    """Each stretch between two nodes once: the first line that has it keeps it."""
+    """Pieces with each stretch between two nodes once: the first line that has it keeps it."""
     seen: set[tuple[int, int]] = set()
     kept = []
     kept_nodes = []

@@ -155,7 +155,7 @@ def piece_of(
 
 
 def with_own_names(pieces: list[LinePiece]) -> list[LinePiece]:
-    """Each name once: the second of a name gets `#2`, in the order of the files."""
+    """Pieces with each name once: the second of a name gets `#2`, in the order of the files."""
     used: set[str] = set()
     named = []
     for piece in pieces:

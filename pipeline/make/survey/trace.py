@@ -72,7 +72,7 @@ def _gapless(piece: LinePiece, survey: Survey, config: SurveyConfig) -> Iterator
 
 
 def _new_track(piece: LinePiece, name: str, survey: Survey, config: SurveyConfig) -> list[LinePiece]:
-    """The stretches of a pass that no earlier one covers, itself included, thinned, each with the toe of its switch."""
+    """The stretches of a pass that no earlier one covers, itself included, thinned, each with its switch toe."""
     parts: list[LinePiece] = []
     known = list(survey.pieces)
     for single_pass in _split_at_repeats(piece, config):

@@ -42,7 +42,7 @@ _SHOWN = 3
 
 
 def ambiguities(site: Site, config: Configuration = _WHOLE) -> tuple[Finding, ...]:
-    """What costs availability wherever trains run on this site: tracks, then balises, that cannot be told apart."""
+    """What costs availability wherever trains run on this site: tracks, then balises, that look alike."""
     return (*parallel_findings(site, config), *window_findings(site, config.lds, config.site))
 
 
@@ -177,7 +177,7 @@ class TrackResolution(NamedTuple):
 
 
 def track_resolution(track: SurveyedTrack, config: MatchingConfig) -> TrackResolution:
-    """By a lasting offset, and by a switch taken, at the survey's stated sigma."""
+    """Distance between tracks that a lasting offset, and that a switch taken can resolve [m]."""
     survey_m = _survey_m(track, config)
     return TrackResolution(
         survey_m,
@@ -202,7 +202,7 @@ class NeighbourPairs(NamedTuple):
 
 
 def neighbouring_tracks(network: Network, limit_m: Floats, config: MatchingConfig) -> NeighbourPairs:
-    """Where another track lies nearer than the limit of an element; each pair once, as places of the first."""
+    """Places where another track lies nearer than the limit of an element; each pair once, as of the first."""
     along = places_along(network.track, SAMPLE_SPACING_M)
     element = along.element
     points = points_of(along.latitude_deg, along.longitude_deg)
@@ -220,7 +220,7 @@ def neighbouring_tracks(network: Network, limit_m: Floats, config: MatchingConfi
 
 
 def _stretches(network: Network, config: MatchingConfig) -> Iterator[_ParallelStretch]:
-    """Per pair of elements the parts of the first that lie too near the second."""
+    """Parts of the first of each pair of elements that lie too near the second."""
     resolution = track_resolution(network.track, config)
     for part in neighbouring_tracks(network, np.fmax(resolution.by_offset_m, resolution.by_switch_m), config).parts():
         one, other = divmod(int(part.pair[0]), network.count)
@@ -260,6 +260,6 @@ def _remedy(site: Site, network: Network, stretch: _ParallelStretch) -> str:
 
 
 def _survey_m(track: SurveyedTrack, config: MatchingConfig) -> Floats:
-    """Per element the survey's sigma, the least of its points; the configured one where it states none."""
+    """Survey sigma of each element, the least of its points [m]; the configured one where it states none."""
     stated = np.where(np.isfinite(track.sigma_m), track.sigma_m, config.survey_sigma_default_m)
     return np.asarray(np.minimum.reduceat(stated, track.first[:-1]))

@@ -58,7 +58,7 @@ def without_balises(balises: pl.DataFrame | None) -> tuple[Finding, ...]:
 
 
 def elements_table(site: Site) -> pl.DataFrame:
-    """Per net element its id, length [m], points, balises, and the elements that a train can reach from either end."""
+    """Net elements with length [m], points, balises, and the elements a train can reach from either end."""
     track = surveyed(site)
     reached: dict[tuple[str, int], list[str]] = {}
     for a, a_end, b, b_end, navigability in site.links.iter_rows():

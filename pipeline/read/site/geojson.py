@@ -84,7 +84,7 @@ def latitude_first(document: Mapping[str, Any]) -> bool:
 
 
 def has_relations(features: Iterable[Any]) -> bool:
-    """Net relations stand beside the lines: a network that says itself where trains can run. Raises `ValueError`."""
+    """Whether net relations come with the lines: a network that says where trains can run. Raises `ValueError`."""
     return any(_is_relation(_plain_keys(None, parts_of(feature)[0])) for feature in features)
 
 

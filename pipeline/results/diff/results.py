@@ -70,7 +70,7 @@ class RunDiff:
 
     @property
     def other_columns(self) -> set[str]:
-        """Columns that changed beside verdicts, hazards and balises."""
+        """Columns that changed, other than verdicts, hazards and balises."""
         shown = {"runs.verdict", "passages.status", *(f"runs.{name}" for name in BALISE_COUNTS)}
         return {item.place for item in self.differences} - shown
 
@@ -91,7 +91,7 @@ class ResultDiff:
         return not (self.only_in_a or self.only_in_b or self.runs)
 
     def text(self, detail: bool = False) -> str:
-        """For people: how much changed, then verdicts, hazards and balises; in `detail` also every other value."""
+        """How much changed, for people; then verdicts, hazards and balises, in `detail` also every other value."""
         lines = [self._sentence(), *(f"note: {note}" for note in self.notes)]
         lines += [f"{run}: only in A" for run in self.only_in_a] + [f"{run}: only in B" for run in self.only_in_b]
         lines += _section("Verdicts", [(run.run_id, text) for run in self.runs for text in run.verdicts], detail)
@@ -110,7 +110,7 @@ class ResultDiff:
         return ", ".join([f"{self.compared} runs in both: {verdict}", *alone])
 
     def _hazards(self) -> list[tuple[str, str]]:
-        """Those that came, went or were judged otherwise, and how many have other figures only."""
+        """Hazards that came, went or were judged otherwise, and how many have other figures only."""
         rows = [(run.run_id, item.short) for run in self.runs for item in run.hazards if item.matters]
         figures = Counter(run.run_id for run in self.runs for item in run.hazards if not item.matters)
         return rows + [(run_id, f"{count} with other figures only") for run_id, count in figures.items()]
@@ -125,7 +125,7 @@ class ResultDiff:
         return ["", f"Other columns that changed: {listed}{more}. --detail shows the values."]
 
     def as_dict(self) -> dict[str, object]:
-        """For programs: plain values, as JSON holds them."""
+        """The difference for programs: plain values, as JSON holds them."""
         return {"same": self.same, **asdict(self)}
 
 

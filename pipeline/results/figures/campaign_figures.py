@@ -194,7 +194,7 @@ def _quantiles(values: pl.Expr, name: str) -> dict[str, pl.Expr]:
 def derived_tables(
     runs: pl.DataFrame, hazards: pl.DataFrame, passages: pl.DataFrame, alarms: pl.DataFrame, config: Configuration
 ) -> dict[str, pl.DataFrame]:
-    """By the name of their file, as in `schemas.campaign`; rows of all runs with their `run_id`, in any order.
+    """Tables by the name of their file, as in `schemas.campaign`; from rows of all runs, in any order.
 
     What has bounds over runs counts no recording twice.
     """

@@ -151,7 +151,7 @@ def _counts() -> dict[str, pl.Expr]:
 
 
 def campaign_balises(passages: pl.DataFrame) -> pl.DataFrame:
-    """Per balise and solution: how often accepted, lost or accepted unsafely, with exact bounds.
+    """How often each balise was accepted, lost or accepted unsafely, per solution, with exact bounds.
 
     Deletions and acceptances are shares of the trains that passed; unsafe acceptances are shares of
     the acceptances that a truth judged. `passages`: `with_truth`.

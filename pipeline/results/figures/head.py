@@ -12,7 +12,7 @@ from schemas.frozen import frozen
 
 
 def worst_verdict(verdicts: Iterable[RunVerdict | str | None]) -> RunVerdict | None:
-    """The verdict that heads several; None stands for one that failed, and proves nothing beside others."""
+    """The verdict that heads several; None stands for one that failed, and proves nothing among others."""
     known = {None if verdict is None else RunVerdict(verdict) for verdict in verdicts}
     if RunVerdict.UNSAFE in known:
         return RunVerdict.UNSAFE
@@ -57,7 +57,7 @@ def head_of(verdicts: Iterable[RunVerdict | None]) -> CampaignHead:
 
 
 def run_verdicts(runs: pl.DataFrame) -> dict[str, RunVerdict | None]:
-    """Each run's verdict, the worst of its solutions, from `runs` with `run_id`."""
+    """Verdict of each run, the worst of its solutions, from `runs` with `run_id`."""
     listed = runs.group_by("run_id").agg(pl.col("verdict").cast(pl.String)).sort("run_id")
     return {run_id: worst_verdict(verdicts) for run_id, verdicts in listed.iter_rows()}
 

@@ -26,7 +26,7 @@ _WRITTEN = "2014-02-10T00:00:00Z"
 
 
 def layers_of(tables: RunTables, site: Site) -> dict[str, pl.DataFrame]:
-    """Each table with `run_id` in front and its place on the rails as `geometry`, null where it is not known."""
+    """Tables with `run_id` in front and the place on the rails as `geometry`, null where it is not known."""
     return {name: _with_geometry(getattr(tables, name), tables.run_id, site) for name in LAYERS}
 
 
@@ -77,7 +77,7 @@ def geopackage_bytes(layers: Mapping[str, pl.DataFrame], place: Path) -> bytes:
 
 
 def _plain(layer: pl.DataFrame) -> pl.DataFrame:
-    """With the types that a GeoPackage has."""
+    """The table with the types that a GeoPackage has."""
     lists = [name for name, kind in layer.schema.items() if isinstance(kind, pl.List)]
     enums = [name for name, kind in layer.schema.items() if isinstance(kind, pl.Enum)]
     times = [name for name, kind in layer.schema.items() if isinstance(kind, pl.Datetime)]

@@ -92,7 +92,7 @@ def _write_mcap(
 
 
 def _write_geoparquet(tables: RunTables, to: Path, site: Site) -> list[Path]:
-    """A file holds one table: epochs under the name asked for, the others beside it."""
+    """Write a file per table: epochs under the name asked for, the others next to it."""
     files = []
     for name, layer in layers_of(tables, site).items():
         files.append(to if name == "epochs" else to.with_suffix(f".{name}.parquet"))

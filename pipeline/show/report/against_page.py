@@ -40,7 +40,7 @@ _PLACES = 20
 
 
 def against_page(out: Address, other: Address) -> str:
-    """The page of `out` beside `other`, over the runs that both have. Raises `UsageError` where there are none."""
+    """The page of `out` and `other`, over the runs that both have. Raises `UsageError` where there are none."""
     this, that = (read_table(of, "runs").collect() for of in (out, other))
     both = this.join(that, on=_RUN, how="semi").select(_RUN)
     if both.is_empty():
@@ -127,7 +127,7 @@ def _names() -> Sequence[str]:
 
 
 def _figures_of(runs: pl.DataFrame) -> list[float | None]:
-    """By `_names`; null where no run knows it."""
+    """Values of the figures in `_names`; null where no run knows it."""
     figures = verdict_figures(runs)
     sums = {name: runs[name].sum() if runs[name].count() else None for name in (*_SUMMED, *_COUNTED, "hazardous_s")}
     most = {name: runs[name].max() for name in _LARGEST}

@@ -171,13 +171,13 @@ def _runs_table(campaign: Campaign) -> str:
 
 
 def _accepted(row: Row) -> Cell:
-    """Of the balises on the path."""
+    """How many of the balises on the path were accepted."""
     found = row["balises_found"]
     return Cell(UNKNOWN) if found is None else Cell("".join(accepted_words(row)), float(found))
 
 
 def _notes(row: Row) -> Cell:
-    """Folded: some are longer than all that stands beside them."""
+    """The notes, folded: some are longer than all around them."""
     notes = notes_apart(row["notes"])
     items = "".join(f"<p>{escape(note)}</p>" for note in notes)
     summary = plural(len(notes), "note")
@@ -185,7 +185,7 @@ def _notes(row: Row) -> Cell:
 
 
 def _whys(campaign: Campaign) -> dict[tuple[str, str], str]:
-    """Per run and solution what is wrong with it, in a few words; nothing where it is safe."""
+    """What is wrong with each run and solution, in a few words; nothing where it is safe."""
     faults = campaign.hazards.partition_by("run_id", as_dict=True)
     offers = campaign.passages.filter(pl.col("hazard_id").is_not_null()).partition_by("run_id", as_dict=True)
     whys = {}

@@ -36,7 +36,7 @@ def frame_table(
     contract: type[dy.Schema] | None = None,
     special: Special | None = None,
 ) -> str:
-    """A frame as a table; `names`: all columns unless said otherwise. Bounds stand beside their figure."""
+    """A frame as a table; `names`: all columns unless said otherwise. Bounds are next to their figure."""
     special = special or {}
     shown = list(names) or _figure_names(frame.columns)
     bounds = bounds_of(frame.columns)

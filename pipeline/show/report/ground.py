@@ -82,7 +82,7 @@ def plan_data(epochs: pl.DataFrame, passages: pl.DataFrame, site: Site | None, m
 
 
 def _shown_rows(t_ns: Ints, codes: Ints, moments_ns: Ints) -> Ints:
-    """So many rows at even distances, the worst in between, and all near the moments that matter."""
+    """At most so many rows at even distances, the worst in between, and all near the moments that matter."""
     stride = -(-len(t_ns) // _POINTS)
     if stride <= 1:
         return np.arange(len(t_ns))
@@ -151,7 +151,7 @@ PIECE_COLUMNS = ("solution", "netelement_id", "measure_m", "moving", "tvb", "ala
 
 
 def availability_pieces(epochs: pl.LazyFrame) -> pl.DataFrame:
-    """Per solution, net element and piece of it: epochs while moving, those with a valid TVB, alarms.
+    """Epochs while moving, those with a valid TVB, and alarms, per solution, net element and piece of it.
 
     Where nobody knows whether the train moved, the epoch counts, and its TVB does not; `known` counts the others.
 
@@ -220,7 +220,7 @@ def availability_map(pieces: pl.DataFrame, hazards: pl.DataFrame, site: Site | N
 
 
 def _places(names: pl.Series, measure_m: Floats, elements: list[str], site: Site | None) -> tuple[Floats, Floats]:
-    """Where measures on net elements are drawn."""
+    """Places where measures on net elements are drawn."""
     if site is None:
         return measure_m, np.array([float(elements.index(name)) for name in names])
     return plane_m(ground_of(site.track, names, measure_m), origin_of(site))
@@ -238,7 +238,7 @@ def _hazards(hazards: pl.DataFrame, elements: list[str], site: Site | None) -> l
 
 
 def _pieces(pieces: pl.DataFrame, elements: list[str], site: Site | None) -> list[Json]:
-    """Each piece as a line; on the ground through five points, none beyond the ends of its element."""
+    """Lines of the pieces; on the ground through five points, none beyond the ends of its element."""
     points = 2 if site is None else 5
     measure_m = np.linspace(pieces["from_m"], pieces["to_m"], points, axis=1)
     if site is not None:

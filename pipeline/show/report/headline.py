@@ -31,7 +31,7 @@ class Headline:
 
 
 def run_headline(rows: Iterable[Row], hazards: pl.DataFrame, passages: pl.DataFrame) -> Headline:
-    """Of one run with all its solutions, headed by the worst of them."""
+    """Headline of one run with all its solutions, headed by the worst of them."""
     listed = list(rows)
     verdict = worst_verdict(row["verdict"] for row in listed)
     heading = next((row for row in listed if row["verdict"] == verdict), listed[0])
@@ -81,7 +81,7 @@ def _worst(run: Row, hazards: pl.DataFrame, passages: pl.DataFrame) -> str:
 
 
 def campaign_headline(runs: pl.DataFrame, hazards: pl.DataFrame, passages: pl.DataFrame) -> tuple[Headline, str | None]:
-    """Of all runs, and the run that it names; frames with `run_id`."""
+    """Headline of all runs, and the run that it names; frames with `run_id`."""
     head = head_of(run_verdicts(runs).values())
     total = sum(head.counts().values())
     counts = ", ".join(f"{count} {name}" for name, count in head.counts().items() if count)
@@ -142,7 +142,7 @@ def facts(rows: Sequence[Row], tables: RunTables, metadata: Mapping[str, str]) -
 
 
 def _odometer(row: Row) -> str:
-    """Where it comes from, and that this is a declaration; nothing without one."""
+    """Origin of the odometer, and that this is a declaration; nothing without one."""
     origin = row["odometer_origin"]
     if origin is None:
         return ""

@@ -117,7 +117,7 @@ def run_page(
 
 
 def _navigation(neighbours: Neighbours) -> str:
-    """To the campaign, and to the runs beside this one."""
+    """Links to the campaign, and to the runs next to this one."""
     links = [link("../index.html", "Campaign", data_go="campaign")]
     for go, words, neighbour in (("previous", "← run", neighbours.before), ("next", "run →", neighbours.after)):
         if neighbour is not None:

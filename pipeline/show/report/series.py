@@ -61,7 +61,7 @@ def time_data(epochs: pl.DataFrame, moments_ns: Ints, gap_reset_s: float) -> Jso
 
 
 def _never_evaluated(epochs: pl.DataFrame, known: Collection[str]) -> dict[str, str]:
-    """Per drawing of monitors none of which was ever evaluated: the most frequent reason."""
+    """The most frequent reason for each drawing of monitors none of which was ever evaluated."""
     silent = {}
     for drawing, lines in monitor_lines().items():
         reasons = [epochs[f"{name}_reason"].cast(pl.String).alias("reason") for name, _ in lines]
@@ -91,7 +91,7 @@ def monitor_lines() -> dict[str, list[list[str]]]:
 
 
 def _ratios(epochs: pl.DataFrame) -> dict[str, Floats]:
-    """Each monitor's statistic over its threshold, signed: beyond -1 and 1 it fails."""
+    """Statistic of each monitor over its threshold, signed: beyond -1 and 1 it fails."""
     ratios = {}
     for monitor in MONITORS:
         value = floats(epochs, f"{monitor}_value")

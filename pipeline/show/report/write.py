@@ -193,7 +193,7 @@ def page_name(run_id: str) -> str:
 
 
 def _with_digest(page: _Page, marker: str) -> _Page:
-    """With the SHA-256 over all that the page follows from: tables, settings, site, neighbours and program.
+    """The page with the SHA-256 over all it follows from: tables, settings, site, neighbours and program.
 
     Empty where the site has no digest: such a page is never known to be there.
     """

@@ -66,7 +66,7 @@ def align(
 
 
 def stated_excess_m2(aligned: AlignedEpochs, holds: Sequence[Hold], config: Configuration) -> Floats:
-    """By how much the variance along the track is larger than stated, as epochs before each show it (DOMAIN section 3).
+    """Variance along the track beyond the stated one, as epochs before each show it (DOMAIN section 3).
 
     Measured in every run, whatever noise is given for the thresholds; nothing of a hold enters.
     """
@@ -152,7 +152,7 @@ def _with_odometer(
     in_use: Estimates,
     config: Configuration,
 ) -> AlignedEpochs:
-    """Each column read at the epoch less the latency in use there."""
+    """Columns of the odometer, read at each epoch less the latency in use there."""
     t_ns = positions.t_ns
     at = odometry.seconds(t_ns) - in_use.latency_s
     known = odometry.known_at_s(at)
@@ -246,7 +246,7 @@ def _without_odometer(
 
 
 def speed_of_positions(t_s: Floats, path_m: Floats, window_s: float) -> Floats:
-    """By positions at least `window_s` apart, causal [m/s]; NaN where there are none."""
+    """Speed by positions at least `window_s` apart, causal [m/s]; NaN where there are none."""
     speed = np.full(t_s.size, np.nan)
     valid = np.flatnonzero(np.isfinite(path_m))
     if valid.size < 2:

@@ -211,7 +211,7 @@ class _Learner:
         return state, np.maximum(use_from, due + 1), joints
 
     def _beyond_break(self, state: FilterState, before: int, row: int) -> FilterState:
-        """Where the odometer lost its distance the offset begins anew: nothing shows whether the position moved."""
+        """Begin the offset anew where the odometer lost its distance: nothing shows whether the position moved."""
         if self._doubt_m[before] == self._doubt_m[row]:
             observed = *self._observation(row), float(self._sigma_m[row]), float(self._jitter_s[row])
             return self._filter.resume(state, *observed, self._moved_m)

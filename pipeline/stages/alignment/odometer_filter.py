@@ -41,7 +41,7 @@ class Estimates(NamedTuple):
         return Estimates(*(np.full(epochs, value) for value in self))
 
     def at(self, rows: Ints) -> Estimates:
-        """At some epochs."""
+        """The estimates at some epochs."""
         return Estimates(*(column[rows] for column in self))
 
     def put(self, begins: Ints, changes: Estimates) -> None:
@@ -103,7 +103,7 @@ class _Scatter(NamedTuple):
 
 
 def _scatters(known: KnownNoise, jitter_s: Floats) -> list[_Scatter]:
-    """Per epoch, as plain numbers: the filter runs row by row."""
+    """Scatters of each epoch, as plain numbers: the filter runs row by row."""
     columns = known.still_m2, jitter_s**2 + known.moving_s2, known.faster_s2, known.shown_mps
     return [_Scatter(*row) for row in zip(*(column.tolist() for column in columns), strict=True)]
 
@@ -236,7 +236,7 @@ class ScaleLatencyFilter:
 
     @cached_property
     def _transition(self) -> Callable[[int], tuple[Floats, Floats]]:
-        """With a memory: a receiver's epochs are mostly the same time apart."""
+        """The transition of one step, remembered: a receiver's epochs are mostly the same time apart."""
         return lru_cache(maxsize=32)(self._transition_over)
 
     def _transition_over(self, dt_ns: int) -> tuple[Floats, Floats]:
@@ -265,7 +265,7 @@ def _nanoseconds(seconds: float) -> int:
 
 
 def prior_of(vehicle: Vehicle, config: AlignConfig) -> Estimates:
-    """By the vehicle file, else the configured prior around 1 and 0."""
+    """Prior of scale and latency by the vehicle file, else the configured one around 1 and 0."""
     scale = 1.0, config.scale_prior_sigma
     latency_s = 0.0, config.latency_prior_sigma_s
     if vehicle.odometer_scale is not None:

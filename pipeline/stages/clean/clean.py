@@ -323,7 +323,7 @@ def stamp_counts(stream: Stream, frame: pl.DataFrame) -> StreamCounts:
 
 
 def _in_order(frame: pl.DataFrame, keys: list[str]) -> tuple[pl.DataFrame, StreamCounts]:
-    """In order of time, the first of each `keys`; how many were duplicates, how many recorded too late."""
+    """Rows in order of time, the first of each `keys`; how many were duplicates, how many recorded too late."""
     frame = frame.with_columns(pl.col("t").cast(pl.Datetime("ns", "UTC")))
     if (np.diff(times_ns(frame)) > 0).all():
         return frame, StreamCounts()

@@ -50,7 +50,7 @@ class Verdicts:
         return np.asarray(self.state == FAIL)
 
     def without_passes(self, reason: NotEvaluated) -> Verdicts:
-        """Of a monitor that can find a fault, but not say that there is none."""
+        """Verdicts of a monitor that can find a fault, but not say that there is none."""
         void = self.state == PASS
         return Verdicts(
             value=np.where(void, np.nan, self.value),
@@ -103,13 +103,13 @@ def verdicts(value: Floats, threshold: Floats, reasons: Ints, state: States | No
 
 
 def no_verdicts(epochs: int, reason: NotEvaluated) -> Verdicts:
-    """Of a monitor that has nothing to look at in the whole run."""
+    """Verdicts of a monitor that has nothing to look at in the whole run."""
     nothing = np.full(epochs, np.nan)
     return verdicts(nothing, nothing, np.full(epochs, NUMBER[reason]))
 
 
 def first_reason(*reasons: tuple[Bools, NotEvaluated | Ints]) -> Ints:
-    """Per epoch the first reason whose mask holds, `NO_REASON` where none does; a reason may be given per epoch."""
+    """The first reason whose mask holds at each epoch, or `NO_REASON`; a reason may be given per epoch."""
     first = np.full(reasons[0][0].shape, NO_REASON)
     for mask, reason in reversed(reasons):
         number = NUMBER[reason] if isinstance(reason, NotEvaluated) else reason
@@ -192,7 +192,7 @@ def failure_log(epochs: pl.DataFrame, recovery_s: float) -> FailureLog:
 
 
 def _fails(state: pl.Series) -> Bools:
-    """Where a monitor fails."""
+    """Whether a monitor fails at each epoch."""
     if isinstance(state.dtype, pl.Enum):
         # By number, several times faster than by word: a replay asks for each of its monitors.
         return np.asarray(ints(state.to_physical()) == FAIL)

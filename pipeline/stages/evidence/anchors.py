@@ -218,7 +218,7 @@ def _movements(stretch: ReferenceStretch) -> tuple[Ints, Ints, Floats]:
 
 
 def _on_one_leg(stretch: ReferenceStretch, begin: Ints, end: Ints) -> tuple[Ints, Ints, Floats]:
-    """Those of these pairs of samples that lie on one leg of the first path, and the movement between them [m]."""
+    """The pairs of samples that lie on one leg of the first path, and the movement between them [m]."""
     path = stretch.paths[0]
     whole = path.leg[begin] == path.leg[end]
     begin = begin[whole]

@@ -134,7 +134,7 @@ def _doubt_m(counter: SignedOdometer, anchor: TrueAnchor, t_ns: Ints) -> Floats:
 
 
 def carried(counter: SignedOdometer, anchor: TrueAnchor, at_m: float, t_ns: Ints, config: Configuration) -> Interval:
-    """On one side of an anchor at `at_m`; the fixed 5 m hold what may be off at the anchor itself."""
+    """The interval on one side of an anchor at `at_m`; the fixed 5 m hold what may be off at the anchor itself."""
     known_m = config.hazards.evidence_factor * anchor.sigma_m + _doubt_m(counter, anchor, t_ns)
     return _carried_from(counter, anchor.t_ns, at_m, t_ns, np.maximum(known_m, config.lds.odometer_fixed_m), config)
 
@@ -201,7 +201,7 @@ def _narrower(
     distances: list[OdometerDistance],
     config: Configuration,
 ) -> Interval:
-    """By both anchors together, or by the one from which less is in doubt, where that is narrower."""
+    """The interval of both anchors together, or that of the less doubtful one, whichever is narrower."""
     doubtful = (distances[0].bound_m > 0.0) | (distances[1].bound_m > 0.0)
     if not doubtful.any():
         return together
@@ -350,7 +350,7 @@ def clock_of(lags: Sequence[Lags], independent: bool, config: HazardConfig) -> R
 def clocks_of(
     lags: tuple[Sequence[Lags], Sequence[Lags]], independent: bool, config: HazardConfig
 ) -> tuple[RecorderClock, RecorderClock]:
-    """Those of reference and reads. One that cannot be measured may have the odometer's clock or that of the other."""
+    """Clocks of reference and reads. One that cannot be measured may be the odometer's or that of the other."""
     first, second = (clock_of(of_one, independent, config) for of_one in lags)
     return _toward_measured_clock(first, second, config), _toward_measured_clock(second, first, config)
 
@@ -365,7 +365,7 @@ def _toward_measured_clock(clock: RecorderClock, other: RecorderClock, config: H
 
 
 def true_clocks_s(clocks: Sequence[RecorderClock]) -> tuple[float, ...]:
-    """By how much the odometer's stamps may be early, least to largest [s]: a measured lag belongs to nobody.
+    """How early the odometer's stamps may be, least to largest [s]: a measured lag belongs to nobody.
 
     If a recorder has it the odometer's own stamps are true, else odometer and GNSS share it, and what the odometer
     stamped one lag before is true: that of any recorder, and all between.

@@ -46,7 +46,7 @@ class KnownPath:
     step_m: Floats
 
     def part(self, rows: slice) -> KnownPath:
-        """Of some samples."""
+        """The same, of some samples only."""
         arrays = {name: getattr(self, name)[rows] for name in ("at_m", "low_m", "high_m", "step_m")}
         return replace(self, path=self.path.part(rows), **arrays)
 
@@ -224,7 +224,7 @@ class Levels:
         return cls(tuple(rows), heights_m, confirmed, drifts, tuple(spikes))
 
     def oriented(self, sense: int) -> Levels:
-        """As the odometer counts up, or back along the path."""
+        """The levels as the odometer counts up, or back along the path."""
         return replace(self, heights_m=sense * self.heights_m)
 
     @property
@@ -249,7 +249,7 @@ class Beyond:
     after_m: tuple[float, ...] = ()
 
     def oriented(self, sense: int) -> Beyond:
-        """As the odometer counts up, or back along the path."""
+        """The levels as the odometer counts up, or back along the path."""
         return Beyond(tuple(sense * m for m in self.before_m), tuple(sense * m for m in self.after_m))
 
 
@@ -306,7 +306,7 @@ def _possible_m(levels: Levels, number: int, beyond: Beyond) -> Floats:
 
 
 def levels_beyond(stretches: Sequence[Levels], steps_m: Sequence[float]) -> list[Beyond]:
-    """For each stretch the levels on both sides of it; `steps_m`: of the reference in the gaps between them."""
+    """The levels on both sides of each stretch; `steps_m`: of the reference in the gaps between them."""
     reversed_steps = [-step_m for step_m in reversed(steps_m)]
     before = _behind(stretches, steps_m, back=False)
     after = _behind(stretches[::-1], reversed_steps, back=True)[::-1]
@@ -314,7 +314,7 @@ def levels_beyond(stretches: Sequence[Levels], steps_m: Sequence[float]) -> list
 
 
 def _behind(stretches: Sequence[Levels], steps_m: Sequence[float], back: bool) -> list[list[float]]:
-    """For each stretch, in this order, the levels of those before it, over its near end [m]."""
+    """The levels of all stretches before each, in this order, over its near end [m]."""
     behind: list[list[float]] = []
     seen_levels_m: list[float] = []
     for number, levels in enumerate(stretches):
@@ -374,7 +374,7 @@ def _unexplained_m(at_m: Floats, t_ns: Ints, least_m: Floats) -> Floats:
 
 
 def _undrivable_m(known: KnownPath, stretch: ReferenceStretch, config: Configuration) -> tuple[Floats, Floats]:
-    """Per step of the reference how far it leads beyond what a train can drive, 0 where it may; and what is allowed."""
+    """How far each step of the reference leads beyond what a train can drive, else 0; and what is allowed."""
     dt_s = np.diff(stretch.t_ns) / NS_PER_S
     root_m = np.hypot(stretch.sigma_m[1:], stretch.sigma_m[:-1])
     driven_m = config.align.braking_mps2 * np.maximum(dt_s, EVEN_S) * dt_s
@@ -441,7 +441,7 @@ def median_along(values: Floats, distance_m: Floats, window_m: float) -> Floats:
 
 
 def _median(values: Floats) -> float:
-    """As `np.median` of finite values, ten times faster for as few as lie in a window."""
+    """The median of finite values, ten times faster than `np.median` for as few as lie in a window."""
     half = values.size // 2
     ordered = np.partition(values, (half - 1, half) if values.size > 1 else half)
     return ordered.item(half) if values.size % 2 else 0.5 * (ordered.item(half - 1) + ordered.item(half))

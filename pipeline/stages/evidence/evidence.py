@@ -43,20 +43,20 @@ class Alternative:
         return 0.5 * (self.low_m + self.high_m)
 
     def where(self, kept: Bools | Ints | slice) -> Alternative:
-        """At some of its instants only."""
+        """The alternative at some of its instants only."""
         return Alternative(self.rows[kept], self.route, self.low_m[kept], self.high_m[kept])
 
     def over(self, first: int, last: int) -> Alternative:
-        """At its rows from one to another one, both included."""
+        """The alternative at its rows from one to another, both included."""
         return self.where(slice(*np.searchsorted(self.rows, [first, last + 1]).tolist()))
 
     def loosened(self, slack_m: Floats) -> Alternative:
-        """By so much more at each instant, on both sides."""
+        """The alternative, wider on both sides by a length at each instant."""
         slack_m = slack_m[self.rows]
         return Alternative(self.rows, self.route, self.low_m - slack_m, self.high_m + slack_m)
 
     def widened(self, factor: float) -> Alternative:
-        """With intervals so many times as wide."""
+        """The alternative, its intervals so many times as wide."""
         half_m = 0.5 * factor * (self.high_m - self.low_m)
         return Alternative(self.rows, self.route, self.middle_m - half_m, self.middle_m + half_m)
 
@@ -114,7 +114,7 @@ class TrainEvidence:
 
     @property
     def gaps(self) -> tuple[Gap, ...]:
-        """Those of the odometer of the LDS."""
+        """The gaps of the odometer that the LDS uses."""
         return self.carried[0].gaps if self.carried else ()
 
     @property
@@ -217,7 +217,7 @@ class TrainEvidence:
         return EvidenceSet(kind, tuple(alternatives), proves, on_survey | (complete & (kind != NOTHING)))
 
     def _covered(self, instants: _Instants, heard: Bools, shown: _Shown, beyond: bool = False) -> list[Alternative]:
-        """By the reference; writes into `shown` where it speaks. `beyond`: past its ends as far as its clock may be."""
+        """Where the reference says the train was; writes into `shown`. `beyond`: past its ends, as its clock may be."""
         alternatives: list[Alternative] = []
         for stretch in self.stretches:
             first_ns = stretch.t_ns[0]
@@ -240,7 +240,7 @@ class TrainEvidence:
     def _carried(
         self, sources: Sequence[Carried], instants: _Instants, wanted: Bools, shown: _Shown
     ) -> list[Alternative]:
-        """By each odometer, from the anchors of its gaps: the train was where one of them says.
+        """Where each odometer says the train was, from the anchors of its gaps: where one of them says.
 
         Writes into `shown`. Between two anchors of one surveyed route that the odometer closes the train was on that
         route; a read itself needs no odometer.
@@ -252,6 +252,7 @@ class TrainEvidence:
             for gap in source.gaps:
                 rows = instants.within(gap.begin_ns, gap.end_ns)
                 rows = rows[open_rows[rows]]
+                # A gap with one anchor is open at one side: nothing is carried beyond a standstill.
                 if len(gap.anchors) == 1:
                     rows = rows[~_after_standing(instants.t_ns[rows], gap, self.stood)]
                 for route in gap.routes or [] if rows.size else []:

@@ -205,7 +205,7 @@ class GapSearch:
         return list(routes.values())
 
     def _orientations(self, gaps: Sequence[Gap]) -> set[bool]:
-        """In which orientation of the network (`Network.usable`) the odometer counts up, over the whole run.
+        """Orientations of the network (`Network.usable`) in which the odometer counts up, over the whole run.
 
         By closed gaps and by the reference (`oriented_elements`), never by the positions that are judged: so it is not
         asked of `odometry.polarity`. Both where nothing decides: a loop turns trains round, parts of the network are

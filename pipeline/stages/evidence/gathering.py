@@ -149,7 +149,7 @@ def known_stretch(
 
 
 def _disputed(t_ns: Ints, reads: Sequence[TrueAnchor], possible_ns: set[int]) -> list[tuple[int, int]]:
-    """For each read within the stretch at which the train was on none of its paths: the time between its neighbours.
+    """The time between the neighbours of each read at which the train was on none of the stretch's paths.
 
     Which of the two was right nobody knows, nor since when: without end where no read confirms the reference.
     """
@@ -388,6 +388,7 @@ def _touched(there: Alternative) -> pl.DataFrame:
         np.maximum(np.searchsorted(route.entry_m, at_m, side="right") - 1, 0) for at_m in (there.low_m, there.high_m)
     )
     count = last - first + 1
+    # Each instant `count` times, and with it the visits from its first on.
     numbers = np.repeat(np.arange(there.rows.size), count)
     visit = np.repeat(first - np.concatenate([[0], np.cumsum(count)[:-1]]), count) + np.arange(count.sum())
     low = route.low_m[visit]

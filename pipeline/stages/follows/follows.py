@@ -119,7 +119,7 @@ def _since_s(frame: pl.DataFrame, epoch_ns: int) -> Floats:
 
 
 def _without_pause(t_s: Floats, recorded_s: Floats, longest_s: float) -> Bools:
-    """Per step of `t_s`: this recorder has a row at least each `longest_s` around its begin and end."""
+    """Whether the recorder has a row at least each `longest_s` around begin and end of each step of `t_s`."""
     pauses = np.flatnonzero(np.diff(recorded_s) > longest_s)
     broken = np.zeros(t_s.size + 1, dtype=np.int64)
     first = np.searchsorted(t_s, recorded_s[pauses], side="right") - 1

@@ -17,7 +17,7 @@ _LONGEST_M = 300.0
 
 
 def branches_beyond_m(network: Network, wanted: set[int]) -> dict[int, float]:
-    """Per oriented element the distance beyond its exit to the next branch of tracks [m], infinite to an open end."""
+    """Distance from each oriented element's exit to the next branch [m], infinite to an open end."""
     beyond: dict[int, float] = {}
     for start in sorted(wanted):
         chain: list[int] = []
@@ -63,13 +63,13 @@ class OneTrack:
         self._near = self._spread(found)
 
     def behind_m(self, node: Node) -> Floats:
-        """Of the switches beyond start and end of the node's element: how far behind them the tracks are one [m]."""
+        """How far behind the switches at start and end of the node's element the tracks are one [m]."""
         zones = (self.zone(2 * node.element + 1), self.zone(2 * node.element))
         near = self._near.get(id(node), set())
         return np.array([zone.length_m if zone.leading in near else 0.0 for zone in zones])
 
     def zone(self, oriented: int) -> Zone:
-        """Of the line's end beyond the exit of an element."""
+        """The zone of the line's end beyond the exit of an element."""
         if oriented not in self._zones:
             self._zones[oriented] = self._measured(oriented)
         return self._zones[oriented]
@@ -108,7 +108,7 @@ class OneTrack:
         return near
 
     def _beyond_m(self, oriented: int, last: int) -> float:
-        """From the exit of an element to that of a later one on its line."""
+        """Distance from the exit of an element to that of a later one on its line [m]."""
         beyond_m = 0.0
         while oriented != last:
             oriented = self._network.successors[oriented][0].to
@@ -306,7 +306,7 @@ def doubtful_stretches(claimed: Claims, t_ns: Ints, element: Ints, read: Bools, 
 
 
 def off_stretches(claimed: Claims, epochs: MatchedEpochs, least_s: float) -> pl.DataFrame:
-    """Where the positions were on no path of the network, by what was known then; shorter ones are jumps.
+    """Stretches on no path of the network, by what was known then; shorter ones are jumps.
 
     Named by the element next to which most of them lay; `offset_m` left of its own sense.
     """
@@ -385,7 +385,7 @@ def _enter_path(line: Ints, element: Ints, p: Floats, one: tuple[int, int], valu
 
 
 def _confidence(left: _LinesLeft, step: Ints, group: Ints, carried_m: Floats, alone: Floats) -> Floats:
-    """Of each epoch in its line, with the step that speaks for it; NaN off the network.
+    """Confidence of each epoch in its line, with the step that speaks for it; NaN off the network.
 
     Near a branch the rivals are those behind it: nothing is known of them yet.
     """
@@ -397,7 +397,7 @@ def _confidence(left: _LinesLeft, step: Ints, group: Ints, carried_m: Floats, al
 
 
 def _hindsight(left: _LinesLeft, step: Ints, group: Ints, alone: Floats) -> Floats:
-    """By paths that live to the end; where one goes over from a line to the next, positions say when."""
+    """Confidence by paths that live to the end; where one goes over to the next line, positions say when."""
     confidence = _confidence(left, step, group, np.zeros(step.size), alone)
     neighbours = [np.clip(step + by, 0, left.group.size - 1) for by in (-1, 0, 1)]
     one = np.logical_and.reduce([left.group[row] >= 0 for row in neighbours])

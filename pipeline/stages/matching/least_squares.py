@@ -107,6 +107,7 @@ def _height_costs(candidates: Candidates, height_m: Floats, sigma_up_m: Floats, 
         return np.zeros(track_m.size)
     begin = candidates.first[:-1][np.diff(candidates.first) > 0]
     of_step = np.repeat(np.arange(begin.size), np.diff(np.append(begin, track_m.size)))
+    # How far the highest and the lowest candidate of each step are apart.
     apart_m = (np.maximum.reduceat(track_m, begin) - np.minimum.reduceat(track_m, begin))[of_step]
     variance_m2 = sigma_up_m[candidates.step] ** 2 + config.height_bias_sigma_m**2
     square = (height_m[candidates.step] - track_m) ** 2 / variance_m2
@@ -161,7 +162,7 @@ class PathCourse:
     place_m: Floats
 
     def place(self, row: int) -> Place:
-        """Where the train was at one of the steps."""
+        """Place of the train at one of the steps."""
         return Place(int(self.step[row]), int(self.oriented[row]), float(self.place_m[row]))
 
 

@@ -249,7 +249,7 @@ def _odometer_sign(odometry: Odometry | None, epochs: MatchedEpochs, config: Mat
 
 
 def read_elements(fixes: Fixes, site: Site, track: SurveyedTrack, balise_reads: pl.DataFrame | None) -> Ints:
-    """Per epoch the element of the balise read then (at the first epoch not before the read), else -1."""
+    """Element of the balise read at each epoch (the first not before the read), else -1."""
     read_element = np.full(len(fixes), -1, dtype=np.int64)
     if balise_reads is None or site.balises is None:
         return read_element

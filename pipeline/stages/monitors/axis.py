@@ -119,7 +119,7 @@ def noise_of_ewma(
 
 
 def _memory(sigma_m: Floats, sigma_before_m: Floats, decorrelation: Floats) -> tuple[Floats, Floats, Floats]:
-    """Of the recursion: phi r, s_k (s_k - phi s_p) and phi r - 1; shapes (n, sources)."""
+    """Terms of the recursion: phi r, s_k (s_k - phi s_p) and phi r - 1; shapes (n, sources)."""
     if np.array_equal(sigma_m, sigma_before_m):
         return 1.0 - decorrelation, sigma_m * (decorrelation * sigma_m), -decorrelation
     ratio = np.divide(sigma_m, sigma_before_m, out=np.ones_like(sigma_m), where=sigma_before_m > 0.0)
@@ -129,7 +129,7 @@ def _memory(sigma_m: Floats, sigma_before_m: Floats, decorrelation: Floats) -> t
 
 
 def before_steps(sigma_m: Floats, decorrelation: Floats, factor: float) -> Floats:
-    """Per source the sigma s_p at the row before, for the recursion; shapes (n, sources).
+    """Sigma s_p of each source at the row before, for the recursion; shapes (n, sources).
 
     Before the first step of a source (a change of its sigma by more than `factor`) the row's own, as printed. Sources
     without memory have no step.
@@ -146,7 +146,7 @@ def before_steps(sigma_m: Floats, decorrelation: Floats, factor: float) -> Float
 
 
 def increment_variance(sigma_m: Floats, sigma_before_m: Floats, decorrelation: Floats) -> Floats:
-    """Of all sources together [m^2]; shape (n,). 2 R (1-phi) where R stays."""
+    """Variance of the increments by all sources together [m^2], shape (n,); 2 R (1-phi) where R stays."""
     correlated = 2.0 * decorrelation * sigma_m * sigma_before_m
     if np.array_equal(sigma_m, sigma_before_m):
         return np.asarray(correlated.sum(axis=1))

@@ -97,7 +97,7 @@ def axes_of(epochs: AlignedEpochs, config: Configuration) -> tuple[Axis, Axis, A
 
 
 def _moving(epochs: AlignedEpochs, t_s: Floats, config: Configuration) -> Bools:
-    """By the odometer: noise of the rows at a stand is no distance driven."""
+    """Whether the train moves, by the odometer: noise of its rows at a stand is no distance driven."""
     travelled_m = epochs.travelled_m
     deadband_mps = config.matching.deadband_mps
     known = np.isfinite(travelled_m)
@@ -300,12 +300,12 @@ class AxisBank:
         return float(known[-1]) * WHITE_PART if known.size else None
 
     def median_noise_m(self) -> tuple[float, ...]:
-        """By monitor; empty where it never was known."""
+        """Median noise at each of the lags [m]; empty where it never was known."""
         known = self.noise_m[np.isfinite(self.noise_m).all(axis=1)]
         return tuple(np.median(known, axis=0).tolist()) if known.size else ()
 
     def verdicts(self) -> dict[str, Verdicts]:
-        """Of the monitors of this axis by name, as far as they are evaluated."""
+        """Verdicts of the monitors of this axis by name, as far as they are evaluated."""
         unknown = np.zeros(self.value.shape[0], dtype=np.bool_)
         unknown[self.series.epoch] = np.isnan(self.noise_m[self.series.epoch]).any(axis=1)
         too_large: Bools = np.any(self.noise_m > self._config.noise_limit_m, axis=1)
@@ -413,7 +413,7 @@ class MonitorBank:
         return epoch + (first if ahead[first] else ahead.size)
 
     def along_evaluated_between(self, epoch: int, end: int) -> Bools:
-        """Of epochs for which `quiet_until` answered."""
+        """Whether the axis along is evaluated at epochs for which `quiet_until` answered."""
         return self._along[epoch:end]
 
     def noise_known_at(self, epoch: int) -> bool:
@@ -454,7 +454,7 @@ class MonitorBank:
         return {name: noise_m for name, noise_m in shown.items() if noise_m}
 
     def verdicts(self) -> dict[str, Verdicts]:
-        """Of each monitor of the bank by name, in the order of the columns of `epochs`."""
+        """Verdicts of each monitor of the bank by name, in the order of the columns of `epochs`."""
         self._look_to_the_end()
         return {name: found for axis in self._axes for name, found in axis.verdicts().items()} | self._single
 

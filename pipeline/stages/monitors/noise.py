@@ -172,7 +172,7 @@ class _SecondDifferences:
     span: float
 
     def looked_back(self, entering: Ints, ends: Ints) -> tuple[Floats, Floats, Floats]:
-        """Of the window of counted samples before each of `ends`: M, its relative standard error, the stated variance.
+        """M of the counted samples in a window before each of `ends`, its relative error, the stated variance.
 
         M is the largest over the quantiles; a window still short is filled with -inf, which sorts first.
         """
@@ -302,12 +302,12 @@ def _ratio(part: Floats, whole: Floats) -> Floats:
 
 
 def _stated_m2(series: AxisSeries, row: Ints, config: MonitorConfig) -> Floats:
-    """Of the Gauss-Markov errors [m^2]."""
+    """Variance of the Gauss-Markov errors [m^2]."""
     return np.asarray((series.sigma_m[row, : error_model(config)[1].size] ** 2).sum(axis=1))
 
 
 def _model_at_m2(series: AxisSeries, row: Ints, lag_s: float, config: MonitorConfig) -> Floats:
-    """Of second differences: smooth errors, and the odometer's walk [m^2]."""
+    """Variance of second differences by the model: smooth errors, and the odometer's walk [m^2]."""
     return _smooth_m2(series, row, lag_s, config) + 2.0 * lag_s * (series.white_m2[row] / series.dt_s[row])
 
 

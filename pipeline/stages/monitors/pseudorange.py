@@ -260,6 +260,7 @@ def _left_over(part: Equations) -> Floats:
     """Least weighted sum of squares over the unknowns, priors included."""
     right = np.einsum("eni,en->ei", part.design * part.weight[..., None], part.residual_m)
     solution = np.linalg.solve(normal_of(part.design, part.weight, part.prior), right[..., None])[..., 0]
+    # r' W r - (A' W r)' x, with x of the normal equations N x = A' W r.
     total = np.einsum("en,en->e", part.weight, part.residual_m**2) - np.einsum("ei,ei->e", solution, right)
     return np.asarray(np.maximum(total, 0.0))
 

@@ -126,7 +126,7 @@ def _window(
 
 
 def _trapezoids_m(t_s: Floats, velocity: Floats) -> Floats:
-    """By trapezoids [m], zero where a velocity is missing."""
+    """Distances by trapezoids of the speeds [m], zero where a velocity is missing."""
     steps = 0.5 * (velocity[1:] + velocity[:-1]) * np.diff(t_s)
     return np.concatenate([np.nan_to_num(steps), [0.0]])
 
@@ -165,7 +165,7 @@ def on_path_of(epochs: pl.DataFrame, channel: pl.DataFrame, lds: LdsConfig) -> p
 
 
 def paired(epochs: pl.DataFrame, channel: pl.DataFrame, lds: LdsConfig) -> pl.DataFrame:
-    """For each epoch: `row_other`, the last row of `channel` since the epoch before, and this solution's `path_m` then.
+    """The last row of `channel` since the epoch before, `row_other`, and this solution's `path_m` then, per epoch.
 
     That is the epoch's own, or between this epoch and the one before, if a movement is interpolated over that; else
     null.
@@ -192,6 +192,7 @@ def _with_sense(epochs: pl.DataFrame) -> pl.DataFrame:
     """Places with `sense`: +1 where the path runs with the measure, -1 against it; 0 where a visit has not shown it."""
     path, measure = (pl.col(name).diff().over("visit") for name in ("path_m", "measure_m"))
     placed = epochs.select(*_PLACE, t_ns=_stamp(), visit=pl.col("netelement_id").rle_id())
+    # Steps along path and measure have equal signs where both grow or both fall.
     moved = (path * measure).fill_null(0.0).cum_sum().over("visit")
     return placed.select("t_ns", *_PLACE, sense=moved.sign().cast(pl.Int8))
 

@@ -67,14 +67,21 @@ def driven_within_m(time_s: float, config: AlignConfig, about_s: float | None = 
 
 
 def window_around_s(time_s: float, config: AlignConfig) -> float:
-    """Over how long the mean speed on either side is taken, w [s]; rounded stamps take in the row at its edge."""
+    """Time over which the mean speed on either side is taken, w [s]; rounded stamps take in the row at its edge."""
     return config.speed_window_s + 0.5 * time_s
 
 
 def odd_runs(t_s: Floats, distance_m: Floats, counts_m: Floats | float, config: AlignConfig) -> OddRuns:
-    """Of rows at these times [s], NaN where not recorded.
+    """Runs of rows in which the counter leapt, stalled or was set, by how it counts elsewhere.
 
-    `counts_m`: the step of the counter as known at each row, 0 where none is.
+    Args:
+        t_s: times of the rows [s], shape (n,).
+        distance_m: what the counter shows [m], NaN where not recorded, shape (n,).
+        counts_m: step of the counter as known at each row [m], 0 where none is, shape (n,) or one for all.
+        config: the section `align` of the configuration.
+
+    Returns:
+        Runs of rows that are odd, and those near enough to odd that a small leap may hide in them.
     """
     rows = np.flatnonzero(np.isfinite(distance_m))
     if rows.size < 3:
@@ -129,12 +136,15 @@ def _by_stamps_m(t_s: Floats, distance_m: Floats) -> Floats:
 
 
 def _running_median(values: Floats, window: int) -> Floats:
-    """Of the values up to each."""
+    """Median of the values up to each."""
     return pl.Series(values).rolling_median(window, min_samples=1).to_numpy().copy()
 
 
 def _periods_s(t_s: Floats, config: AlignConfig) -> Floats:
-    """Mean of the steps before each, pauses cut short: a median would be that within a bunch."""
+    """Mean period of the rows before each step [s], pauses cut short.
+
+    A median would be the period within a bunch of rows that arrive together.
+    """
     means = pl.Series(np.minimum(np.diff(t_s), config.odometer_gap_s)).rolling_mean(_PERIOD_ROWS, min_samples=1)
     means_s = means.to_numpy()
     return np.concatenate([means_s[:1], means_s[:-1]])
@@ -254,7 +264,7 @@ class _Sums(NamedTuple):
 
     @classmethod
     def of(cls, t_s: Floats, distance_m: Floats, left_out: Bools) -> _Sums:
-        """Over all steps but those left out."""
+        """The bound over all steps but those left out."""
         distances, times = (
             np.concatenate([[0.0], np.cumsum(np.where(left_out, 0.0, np.diff(values)))]) for values in (distance_m, t_s)
         )
@@ -334,6 +344,7 @@ class Bound:
     ) -> Bound:
         """All per step: `doubtful` by leaps, stalls, pauses, slip, speeds; `lost`, not known at all; by `least_m`."""
         begun_m, ended_m = np.zeros((2, t_s.size))
+        # Number of losses before each step.
         gone = np.concatenate([[0], np.cumsum(lost)])
         for run in weighed(t_s, distance_m, doubtful | lost, config):
             off_m = max(run.off_m, float(least_m[run.first : run.last].sum()))
@@ -343,7 +354,7 @@ class Bound:
         return cls(t_s, np.cumsum(begun_m), np.cumsum(ended_m))
 
     def between_m(self, begin_s: Floats, end_s: Floats) -> Floats:
-        """Of the movements between instants, in either order; lost outside the recording."""
+        """Bound of the movements between instants [m], in either order; lost outside the recording."""
         first_s, last_s = np.minimum(begin_s, end_s), np.maximum(begin_s, end_s)
         before = np.searchsorted(self.t_s, first_s, side="right") - 1
         after = np.searchsorted(self.t_s, last_s, side="left")

@@ -55,7 +55,7 @@ def with_hysteresis(distance_m: Floats, width_m: Floats) -> Floats:
 
 
 def _row_by_row(at_m: float, least_m: Floats, most_m: Floats) -> list[float]:
-    """Where movements to and fro are shorter than a block is worth."""
+    """The distance with hysteresis row by row, where movements to and fro are shorter than a block is worth."""
     values = []
     for low_m, high_m in zip(least_m.tolist(), most_m.tolist(), strict=True):
         at_m = min(max(at_m, low_m), high_m)
@@ -104,7 +104,7 @@ def is_moving(t_s: Floats, driven_m: Floats, deadband_mps: float, window_s: floa
 
 
 def moving_steps(t_s: Floats, distance_m: Floats, deadband_mps: float, window_s: float) -> Bools:
-    """Per step between samples: mean speed beyond the dead band, over `window_s` at least, centred on the step."""
+    """Mean speed of each step beyond the dead band, over `window_s` at least, centred on the step."""
     half_s = 0.5 * np.maximum(np.diff(t_s), window_s)
     centre_s = 0.5 * (t_s[1:] + t_s[:-1])
     begin_m, end_m = (np.interp(at_s, t_s, distance_m) for at_s in (centre_s - half_s, centre_s + half_s))

@@ -109,11 +109,11 @@ class Odometry:
         return ((t_ns - self.epoch_ns) * 1e-9).astype(np.float64)
 
     def known_at(self, t_ns: Ints) -> Bools:
-        """As `known_at_s`, for instants [ns]."""
+        """Whether the distance is known at instants [ns], as `known_at_s`."""
         return self.known_at_s(self.seconds(t_ns))
 
     def slips_at_s(self, t_s: Floats) -> Bools:
-        """By the sample before or after."""
+        """Whether the sample before or after is slip."""
         return self._slips_between(*self._around(t_s))
 
     def doubt_at_s(self, t_s: Floats) -> Floats:
@@ -121,7 +121,7 @@ class Odometry:
         return np.interp(t_s, self.t_s, self.doubt_m)
 
     def distance_at(self, t_ns: Ints) -> Floats:
-        """As recorded [m]; NaN where it is not known."""
+        """Distance as recorded at instants [m]; NaN where it is not known."""
         t_s = self.seconds(t_ns)
         return np.where(self.known_at_s(t_s), self.distance_at_s(t_s), np.nan)
 
@@ -178,7 +178,7 @@ class Odometry:
         return OdometerDistance(scale * recorded, variance, bound_m)
 
     def bound_between_m(self, begin_ns: Ints | int, end_ns: Ints) -> Floats:
-        """By how much the distance between instants may be off, as braking and acceleration prove it [m]."""
+        """How much the distance between instants may be off, as braking and acceleration prove it [m]."""
         begin_ns = np.broadcast_to(begin_ns, end_ns.shape)
         if self.bound is None:
             return np.zeros(end_ns.size)
@@ -263,7 +263,7 @@ class Odometry:
         return self.known_noise.at(self._sample_at(t_s))
 
     def known_row_sigma_m(self, t_s: Floats) -> Floats:
-        """Of the rows' noise, as known at these instants [m]."""
+        """Sigma of the rows' noise, as known at these instants [m]."""
         return np.sqrt(self.noise_at_s(t_s).row_m2(self.speed_at_s(t_s)))
 
     def hysteresis_m(self, t_s: Floats) -> Floats:
@@ -274,7 +274,7 @@ class Odometry:
         return np.where(self.noise_at_s(t_s).shown, hysteresis_m(self.known_row_sigma_m(t_s), self.config), np.inf)
 
     def row_sigma_m(self, t_s: Floats) -> Floats:
-        """Of the rows' noise, as the run shows it [m]."""
+        """Sigma of the rows' noise, as the run shows it [m]."""
         if not self.noise.quantisation:
             return np.zeros(t_s.size)
         return np.sqrt(self.noise.quantisation.variance_m2(self.speed_at_s(t_s)))
@@ -395,7 +395,7 @@ def odometry_of(stream: pl.DataFrame | None, vehicle: Vehicle, config: Configura
 def _contradicted(
     t_s: Floats, distance_m: Floats, distances: StepDistances, noise: KnownNoise, config: Configuration
 ) -> Contradiction:
-    """Where the speeds contradict the counted distance beyond the noise of its rows, at their speed by the distance."""
+    """Whether the speeds contradict the counted distance beyond the noise of its rows."""
     align = config.align
     begin_s = np.maximum(t_s - align.speed_window_s, t_s[0])
     speed_mps = (distance_m - np.interp(begin_s, t_s, distance_m)) / np.maximum(t_s - begin_s, 1e-9)
@@ -425,13 +425,13 @@ def _guessed_distances(
 
 
 def _slips(stream: pl.DataFrame, config: AlignConfig) -> Bools:
-    """By the flag, or by a sigma of the speed beyond any use."""
+    """Whether a row is slip, by its flag or by a sigma of the speed beyond any use."""
     slips: Bools = truths(stream["slip"]) | (floats(stream, "sigma_speed_mps") > config.slip_sigma_mps)
     return slips
 
 
 def _slip_doubt_m(moved_m: Floats, dt_s: Floats, slip: Bools, sigma_mps: Floats, config: AlignConfig) -> Floats:
-    """By how much the count of each step into, in or out of slip may be off [m].
+    """How much the count of each step into, in or out of slip may be off [m].
 
     A share of the step, or its reported sigma times dt: the error lasts while it slips. A locked wheel counts nothing.
     """

@@ -72,7 +72,7 @@ def polarity(odometry: Odometry, t_ns: Ints, path_m: Floats, distance_m: float) 
 
 
 def shared_movement_m(counted_m: Floats, other_m: Floats) -> Floats:
-    """Of two recorders' movements over the same times what both moved, negative where in opposite senses [m].
+    """What two recorders both moved over the same times [m], negative where in opposite senses.
 
     The noise of one that stands has no direction to give to a movement that the other counts.
     """

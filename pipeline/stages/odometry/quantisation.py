@@ -43,7 +43,7 @@ class QuantisationNoise:
         return self.still_m2 + self.moving_s2 * speed_mps**2
 
     def of_counter(self, counter_m: float) -> QuantisationNoise:
-        """At least that of its step, which does not show at one speed."""
+        """The scatter, at least that of the counter's step, which does not show at one speed."""
         return QuantisationNoise(max(self.still_m2, counter_m**2 / 12.0), self.moving_s2)
 
     def __bool__(self) -> bool:
@@ -115,7 +115,10 @@ class KnownScatter(NamedTuple):
 def known_at_rows(
     pieces: ScatterPieces, first_m2: Floats, renewal_s: float, t_s: Floats, config: AlignConfig
 ) -> KnownScatter:
-    """As the last pieces before each row show it; `first_m2`: of each row until there are enough of them."""
+    """The scatter at each row, as the last pieces before it show it.
+
+    `first_m2`: the scatter [m^2] of each row until there are enough pieces.
+    """
     size = t_s.size
     known = KnownScatter(first_m2.copy(), np.zeros(size), np.full(size, np.inf), np.zeros(size, dtype=np.bool_))
     renewed_s = -np.inf
@@ -272,7 +275,7 @@ class KnownNoise:
     shown: Bools
 
     def at(self, samples: Ints) -> KnownNoise:
-        """At some of the samples."""
+        """The scatter at some of the samples."""
         return KnownNoise(*(getattr(self, each.name)[samples] for each in fields(self)))
 
     def row_m2(self, speed_mps: Floats) -> Floats:

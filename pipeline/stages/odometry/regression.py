@@ -97,7 +97,7 @@ class Regression:
         return [float(value) for pair in zip(theta, sigmas, strict=True) for value in pair]
 
     def _without_one(self, design: Floats, instruments: Floats, theta: Floats) -> Floats:
-        """By how much each part of the estimate changes at most without a change of speed, a minute, a quarter.
+        """Largest change of each part of the estimate without one change of speed, one minute, one quarter.
 
         One change of speed alone looks like a step or drift of the other recorder, or a slip, that came with it and
         may last as long.

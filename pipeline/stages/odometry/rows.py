@@ -16,7 +16,7 @@ _WORST_LAST = (Origin.WHEEL, Origin.RADAR, Origin.INERTIAL, Origin.UNKNOWN, Orig
 
 
 def declared_origin(stream: pl.DataFrame, vehicle: Vehicle) -> Origin:
-    """What the rows of one sensor say, for those that say nothing the vehicle file.
+    """Origin that the rows of one sensor state, or the vehicle file for rows that state none.
 
     Of rows that say different things the origin that proves least: GNSS before a filter before unknown.
     """
@@ -94,6 +94,7 @@ def _shown(moves_m: Floats) -> Bools:
     written = np.rint(moves_m / _ROUNDED_M)
     bent = np.concatenate([[False], np.diff(written) != 0.0])
     bends = np.cumsum(bent)
+    # Rows since the last bend: the row less the greatest row of a bend up to it.
     since_bend = np.arange(written.size) - np.maximum.accumulate(np.where(bent, np.arange(written.size), 0))
     even = np.logical_or.accumulate((since_bend >= FEWEST_BENDS) & (written > 0.0))
     shown: Bools = (bends == 0) | (bends >= FEWEST_BENDS) | even
@@ -108,7 +109,7 @@ def _usual(moves_m: Floats, config: AlignConfig) -> Bools:
 
 
 def _steps_known_m(moves_m: Floats, least_m: float) -> Floats:
-    """Of which step all movements up to each are multiples; 0 where there is none [m]."""
+    """The step of which all movements up to each are multiples [m]; 0 where there is none."""
     single_m = np.minimum.accumulate(np.where(moves_m > _ROUNDED_M, moves_m, np.inf))
     begins = np.flatnonzero(single_m < np.concatenate([[np.inf], single_m[:-1]]))
     steps_m = np.zeros(moves_m.size)
@@ -275,7 +276,7 @@ def _trusted(driven_m: Floats, recorded_m: Floats, leap: Bools, config: AlignCon
 
 
 def _driven(t_s: Floats, speed_mps: Floats) -> Floats:
-    """By trapezoids [m]."""
+    """Distance by trapezoids of the speeds [m]."""
     steps: Floats = 0.5 * (speed_mps[1:] + speed_mps[:-1]) * np.diff(t_s)
     return steps
 

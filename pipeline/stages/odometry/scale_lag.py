@@ -147,7 +147,7 @@ _Figure = TypeVar("_Figure", float, Floats)
 
 
 def slopes(moved_m: _Figure, speed_mps: _Figure, scale: float = 1.0) -> tuple[_Figure, _Figure]:
-    """By how much the movement of the other changes with scale and with lag; with scale * lag at a `scale` of 1."""
+    """Change of the other's movement with scale and with lag; with scale * lag at a `scale` of 1."""
     return moved_m, -scale * speed_mps
 
 
@@ -252,7 +252,7 @@ class _DistancePairs:
 
     @property
     def count(self) -> float:
-        """So many that do not overlap."""
+        """Number of movements that do not overlap."""
         return 1.0 + (self.begin_s.size - 1.0) / self.overlap
 
     @cached_property
@@ -263,7 +263,7 @@ class _DistancePairs:
 
     @property
     def step(self) -> int:
-        """Of so many movements one is looked at in a search: they do not overlap."""
+        """One of so many movements is looked at in a search: they do not overlap."""
         return max(self.overlap, self.begin_s.size // _SEARCHED, 1)
 
     def _apart_m(self, lag_s: Floats) -> tuple[Floats, Floats]:
@@ -342,7 +342,7 @@ class _DistancePairs:
         return replace(found, lag_sigma_s=found.lag_sigma_s + moved_s)
 
     def _regression(self, lag_s: float, doubt_s: float) -> Regression | None:
-        """At the lag assumed; `doubt_s`: by how much it may still be off, which makes no outlier."""
+        """The estimate at an assumed lag; `doubt_s`: by how much it may be off, which makes no outlier."""
         begin_s, end_s = self.begin_s - lag_s, self.end_s - lag_s
         counted = self.counter.gained(begin_s, end_s)
         (first, first_instrument), (last, last_instrument) = self.counter.speeds(begin_s), self.counter.speeds(end_s)

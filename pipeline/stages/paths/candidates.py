@@ -39,7 +39,7 @@ class Segments(Polyline):
     distance_along_m: Floats
 
     def search(self, box: Box | None = None) -> Search:
-        """Of all segments, or of those in a box: a run is looked for about itself, not in all of a network."""
+        """The search over all segments, or those in a box: a run needs only the part of a network about it."""
         from scipy.spatial import cKDTree  # takes long to load, and a log needs none
 
         rows = np.arange(len(self)) if box is None else box.touched_by(self.start, self.end)
@@ -52,9 +52,11 @@ class Segments(Polyline):
         some = np.union1d(rows, np.maximum(rows - 1, 0))
         pieces = np.maximum(1, np.ceil(self.length_m[some] / (0.25 * PROBE_SPACING_M))).astype(np.int64)
         segment = np.repeat(some, pieces)
+        # Number of each point within its segment.
         number = np.arange(len(segment)) - np.repeat(np.cumsum(pieces) - pieces, pieces)
         fraction = (number + 0.5) / np.repeat(pieces, pieces)
         place = self.distance_along_m[segment] - self.length_m[segment] * (1.0 - fraction)
+        # The first point in each bucket of distance along the element is enough.
         bucket = np.floor(place / (0.75 * PROBE_SPACING_M))
         new = np.ones(len(segment), dtype=np.bool_)
         new[1:] = (bucket[1:] != bucket[:-1]) | (np.diff(self.element[segment]) != 0)
@@ -118,7 +120,7 @@ class Candidates:
         return Candidates(first=np.searchsorted(step, np.arange(steps + 1)), **columns)
 
     def renumbered(self, kept: Bools) -> Candidates:
-        """As before, steps counted among the kept ones only; the others have no candidates."""
+        """The candidates with steps counted among the kept ones only; the others have no candidates."""
         number = np.cumsum(kept) - 1
         step = number[self.step]
         return replace(self, step=step, first=np.searchsorted(step, np.arange(int(kept.sum()) + 1)))
@@ -131,6 +133,7 @@ _COLUMNS = tuple(column.name for column in fields(Candidates) if column.name != 
 def segments_of(track: SurveyedTrack) -> Segments:
     """Segments of all elements."""
     owner = np.repeat(np.arange(len(track.ids)), np.diff(track.first))
+    # A segment begins at each vertex but the last of an element.
     head = np.flatnonzero(owner[:-1] == owner[1:])
     start = track.surface[head]
     end = track.surface[head + 1]
@@ -140,12 +143,12 @@ def segments_of(track: SurveyedTrack) -> Segments:
 
 
 def search_about(places: Floats, network: Network, reach_m: float) -> Search:
-    """Where to look for candidates of these places, up to a reach [m]."""
+    """The search for candidates about these places, up to a reach [m]."""
     return segments_of(network.track).search(box_about(places, reach_m + PROBE_SPACING_M))
 
 
 def candidates_of(points: Points, network: Network, search: Search, reach_m: float) -> Candidates:
-    """For every point the nearest place on each element within reach.
+    """The nearest place on each element within reach of every point.
 
     Args:
         points: positions, shape (n, 3).
@@ -212,7 +215,7 @@ def overtaken(candidates: Candidates, network: Network) -> Bools:
 
 
 def _past_ends_m(candidates: Candidates) -> Floats:
-    """Per candidate how far it lies past its element's start and end [m], negative inside, infinite if not near."""
+    """How far each candidate lies past its element's start and end [m], negative inside, infinite if not near."""
     columns = []
     for past, inside_m in ((-1, candidates.along_m), (1, candidates.left_m)):
         inside = np.where((candidates.past == 0) & (inside_m < BEND_M), -inside_m, np.inf)
@@ -266,6 +269,7 @@ def _candidates(points: int, network: Network, segments: Segments, step: Ints, f
 
 def _headings_rad(track: SurveyedTrack, vertex: Ints) -> Floats:
     """Heading of the segments that begin at these vertices, clockwise from north."""
+    # Steps share vertices: each heading once.
     some, which = np.unique(vertex, return_inverse=True)
     places = points_of(track.latitude_deg[some], track.longitude_deg[some])
     along = track.surface[some + 1] - track.surface[some]

@@ -110,7 +110,7 @@ class _Growth:
         return len(self._begun_s) > self.config.paths_limit
 
     def _restart_step(self, nodes: list[Node]) -> int:
-        """Where the set begins anew once these are all refuted: at once in the first minute, later where it came back.
+        """The step at which the set begins anew once all are refuted: at once in the first minute, else the return.
 
         The number of steps where one of them lives to the end, or nothing leads back.
         """
@@ -160,7 +160,7 @@ class _Growth:
         return near
 
     def _stretch(self, oriented: int, rows: Ints) -> Stretch:
-        """Of an oriented element at its candidates."""
+        """The stretch of an oriented element at its candidates."""
         candidates = self.candidates
         turned = oriented % 2
         return Stretch(
@@ -173,12 +173,12 @@ class _Growth:
 
     @cached_property
     def _track_spacing_m(self) -> Floats:
-        """Per candidate the distance to the nearest track on the side of the position [m], 0 without one."""
+        """Distance from each candidate to the nearest track on the side of the position [m], 0 without one."""
         return np.where(self.candidates.offset_m > 0.0, *self._sides_m)
 
     @cached_property
     def _sides_m(self) -> tuple[Floats, Floats]:
-        """Per candidate how far left and right in its own sense the nearest other track lies [m], 0 without one.
+        """Distance of the nearest other track to the left and right of each candidate, in its sense [m], 0 without one.
 
         The tracks of a step in the order in which they lie side by side, but for those that end before it.
         """

@@ -66,7 +66,7 @@ class Node:
         return chain[::-1]
 
     def residuals_m(self, first: int, last: int) -> Floats:
-        """Of its path over the steps from `first` on, before `last`; NaN before its beginning."""
+        """Residuals of its path over the steps from `first` on, before `last` [m]; NaN before its beginning."""
         chain = self.since(first)
         known = np.concatenate([node.along.residual_m for node in chain])
         whole_m = np.full(last - first, np.nan)
@@ -93,7 +93,7 @@ class ResidualsBefore:
 
     @cached_property
     def residual_m(self) -> Floats:
-        """Over the longest window [m]."""
+        """Residuals over the longest window [m]."""
         return self.node.residuals_m(int(self.begins[-1]), self.node.begin)
 
 
@@ -139,7 +139,7 @@ class PathSet:
         return spans
 
     def survivors(self) -> list[Node]:
-        """Those that live to the last step; of one that ends off the network, those refuted in its last minute."""
+        """Paths that live to the last step; of one that ends off the network, those refuted in its last minute."""
         count = len(self.steps)
         found: list[Node] = []
         for stretch in {node.stretch for node in self.nodes}:
@@ -165,7 +165,7 @@ class PathSet:
         return [Span(node, node.begin, end, np.full(end - node.begin, p)) for node, end, p in ends if end > node.begin]
 
     def elements(self, delay_s: float | None = None) -> list[dict[int, float]]:
-        """Per step the net elements that no rejection rules out, each with the largest p-value of a path over it.
+        """Net elements of each step that no rejection rules out, with the largest p-value of a path over each.
 
         In hindsight, or by what was known `delay_s` before the end of each step. Empty: off the network.
         """
@@ -258,7 +258,7 @@ class ReturnSearch:
         return np.hypot(self.steps.sigma_m[-size:], left.survey_m)
 
     def _moved_m(self, left: Left, size: int) -> Floats:
-        """By more than so much two means a while apart differ on no path, for the last steps [m]."""
+        """Limit by which two means a while apart differ on no path, at the last steps [m]."""
         return self.tests.moved_m(self.steps.sigma_m[-size:], np.full(size, left.survey_m))
 
     def _windows_m(self, line: set[int], left: Left, window: int) -> Floats:

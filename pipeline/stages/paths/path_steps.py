@@ -97,11 +97,12 @@ def path_steps(
     """
     t_s = (t_ns - t_ns[0]) / NS_PER_S if t_ns.size else np.zeros(0)
     second = np.floor(t_s + 1e-6).astype(np.int64)
+    # The first position of each second, and the number of them.
     first = np.flatnonzero(np.diff(second, prepend=-1))
     size = np.diff(first, append=t_ns.size)
 
     def mean(values: Floats) -> Floats:
-        """Over the positions of each second, shape (n, ...) to (steps, ...)."""
+        """Means over the positions of each second, shape (n, ...) to (steps, ...)."""
         return np.asarray(np.add.reduceat(values, first, axis=0).T / size).T
 
     means = Points(*(mean(vectors) for vectors in (points.surface, points.east, points.north)))
@@ -217,7 +218,7 @@ class Moves:
         return cls(network, steps, np.full(count, np.nan), np.zeros(count), unknown, config)
 
     def distance(self, earlier: int, later: int) -> StepDistance:
-        """By the odometer where it knows it, else straight on."""
+        """Distance between steps by the odometer where it knows it, else straight on [m]."""
         places = self.steps.points.surface
         chord_m = float(np.linalg.norm(places[later] - places[earlier]))
         counted_m = float("nan")
@@ -243,7 +244,7 @@ class Moves:
 
     @property
     def break_cost(self) -> float:
-        """Of going over to a track that no relation leads to: so many seconds of positions off the path."""
+        """Cost of going over to a track that no relation leads to: so many seconds of positions off the path."""
         return self.config.break_s * self.config.outlier_sigmas**2
 
     def _all(self, here: Place, there: Place, distance: StepDistance) -> Iterator[tuple[float, int, tuple[int, ...]]]:

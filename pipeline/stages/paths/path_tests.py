@@ -143,22 +143,22 @@ class PathTests:
         )
 
     def moved_m(self, sigma_m: Floats, survey_m: Floats) -> Floats:
-        """By more than so much two means of `paths_level_s`, a while apart, differ on no path [m]."""
+        """Limit by which two means of `paths_level_s`, a while apart, differ on no path [m]."""
         limit = _size(self.config.paths_alpha, LOOKED_S / self.config.paths_level_s)
         return np.asarray(limit * np.sqrt(2.0) * np.hypot(sigma_m, survey_m))
 
     @property
     def longest_s(self) -> float:
-        """As far back as a movement looks."""
+        """The longest time that a movement looks back [s]."""
         return 3.0 * WINDOWS_S[-1]
 
     def totals(self, steps: PathSteps, begin: int, along: Stretch) -> Totals:
-        """Over the steps from `begin` on."""
+        """Sums over the steps from `begin` on."""
         counted = self._step_terms(steps, begin, along)
         return Totals(*(float(value) for value in counted[: len(NO_STEPS)].sum(axis=1)))
 
     def farthest_m(self, steps: PathSteps, apart_m: Floats, last: int, window_s: float) -> float:
-        """Of differences at the steps before `last`, 0 where none counts, the largest mean over any window [m].
+        """Largest mean over any window of differences at the steps before `last`, 0 where none counts [m].
 
         Windows may end later, where nothing differs; none counts with fewer than `_WHOLE` of its steps.
         """
@@ -276,7 +276,7 @@ class PathTests:
 
 
 def switch_resolution_m(survey_m: Floats, alpha: float, merged_m: float) -> Floats:
-    """How far apart tracks have to be for a movement from one to the other to be seen, with exact positions [m]."""
+    """How far apart tracks must be for a movement from one to the other to show, with exact positions [m]."""
     return np.asarray(_size(alpha, LOOKED_S / WINDOWS_S[0]) * np.sqrt(2.0) * survey_m + 2.0 * merged_m)
 
 
@@ -331,7 +331,7 @@ def _tails(sigmas: Floats) -> Floats:
 
 @cache
 def _greatest_shares(tau_s: float) -> Floats:
-    """Per window the variance of a movement over that of the noise, the greatest over all noises of at least `tau_s`.
+    """Variance of a movement over that of the noise in each window, the greatest over all noises of `tau_s` or more.
 
     Of Gauss-Markov noises with these correlation times.
     """
@@ -348,7 +348,7 @@ def _greatest_shares(tau_s: float) -> Floats:
 
 
 def _windows(t_s: Floats, window_s: float) -> tuple[Ints, Ints, Ints]:
-    """Of the last window the first step, of the window before the last but one the step after it, and its first."""
+    """First step of the last window; the step after the window before the last but one, and the first step of that."""
     late, early_end, early = (np.searchsorted(t_s, t_s - k * window_s, side="right") for k in (1.0, 2.0, 3.0))
     return late, early_end, early
 
@@ -375,6 +375,7 @@ def _measured_m2(steps: PathSteps, window_s: float) -> Floats:
     late, early_end, early = _windows(steps.end_s, window_s)
     period_s = steps.period_s
     counts = np.concatenate([[0], np.cumsum(known)])
+    # Sum and number of a window's values: differences of running ones.
     sums = np.concatenate([[0.0], np.cumsum(np.where(known, steps.along_m, 0.0))])
     late_count = counts[rows + 1] - counts[late]
     early_count = counts[early_end] - counts[early]
@@ -385,6 +386,7 @@ def _measured_m2(steps: PathSteps, window_s: float) -> Floats:
     moved_m = np.where(whole, moved_m, 0.0)
     number = np.cumsum(whole)
     mean_m = np.cumsum(moved_m) / np.maximum(number, 1)
+    # Var(x) = E[x^2] - E[x]^2, of all windows up to each step.
     variance_m2 = np.cumsum(moved_m**2) / np.maximum(number, 1) - mean_m**2
     enough = number >= _MEASURED_WINDOWS * window_s / period_s
     return np.where(enough, np.maximum(variance_m2, 0.0), np.nan)

@@ -85,7 +85,7 @@ def _route_over(
     """
 
     def nearest(links: list[Link]) -> Link | None:
-        """In time to the link that the route is grown from; of equal ones one that no route covers yet."""
+        """The link nearest in time to the one grown from; of equal ones one that no route covers yet."""
         return min(links, key=lambda option: (abs(option.at - link.at), option in covered), default=None)
 
     links = [link]
@@ -197,7 +197,7 @@ def _link_visits(
 
 
 def _place(node: Node, step: int) -> Place:
-    """Where a path was at one of its steps."""
+    """Place of a path at one of its steps."""
     row = min(max(step - node.begin, 0), node.end - node.begin - 1)
     return Place(step, node.oriented, float(node.left_m[row, node.oriented % 2]))
 

@@ -36,7 +36,7 @@ class ReferencePath:
     root_m: Floats
 
     def part(self, rows: slice) -> ReferencePath:
-        """Of some samples."""
+        """The same path, of some samples only."""
         arrays = {name: getattr(self, name)[rows] for name in ("leg", "at_m", "aside_m", "root_m")}
         return replace(self, **arrays)
 
@@ -292,7 +292,7 @@ class Samples:
 
 
 def samples_of(reference: pl.DataFrame, network: Network, config: Configuration) -> Samples:
-    """Of a reference stream; places twice as far off as any that can be a sample's."""
+    """Samples of a reference stream; places twice as far off as any that can be a sample's."""
     hazards = config.hazards
     sigma_m = reference["sigma_m"].fill_null(hazards.reference_sigma_m).to_numpy()
     points = points_of(floats(reference, "latitude_deg"), floats(reference, "longitude_deg"))

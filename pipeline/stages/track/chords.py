@@ -104,7 +104,7 @@ def _segments(track: SurveyedTrack, vertex: Ints) -> tuple[Floats, Floats]:
 
 
 def _straightest(leave_rad: Floats, enter_rad: Floats, here: Ints, there: Ints) -> tuple[Ints, Floats]:
-    """Per oriented element its successor with the least turn, -1 without one, and that turn [rad].
+    """Successor of each oriented element with the least turn, -1 without one, and that turn [rad].
 
     `leave_rad`, `enter_rad`: heading at the exit and the entry of each; `here`, `there`: pairs of successors.
     """
@@ -145,7 +145,7 @@ def _vertices(track: SurveyedTrack, chain: Sequence[int]) -> tuple[Ints, Ints]:
 
 
 def _sigmas_m(distance_m: Floats, turn_rad: Floats) -> Floats:
-    """Of each segment between points of a chain the largest sigma of all chords that it may be a part of.
+    """Largest sigma of all chords that each segment between points of a chain may be a part of [m].
 
     A chord spans 1, 2, ... `points` segments. Its turn is the geometric mean of the turns at its ends (0 with a
     straight at one of them) less the turn within it. Where the chain ends, with the survey or at a switch, its turn is

@@ -137,12 +137,12 @@ class Network:
 
     @cached_property
     def connected(self) -> Ints:
-        """Per net element the number of the part that it is connected with, whatever the direction of trains."""
+        """Number of the part that each net element is connected with, whatever the direction of trains."""
         return np.asarray(self.parts.reshape(-1, 2).min(axis=1))
 
     @cached_property
     def unbranched(self) -> Ints:
-        """Per net element the number of the line without a branch that it belongs to, however it is cut."""
+        """Number of the line without a branch that each net element belongs to, however it is cut."""
         from scipy.sparse import coo_array
         from scipy.sparse.csgraph import connected_components
 
@@ -201,7 +201,7 @@ class Network:
         return next(edge for edge in self.successors[here] if edge.to == to)
 
     def linked_ends(self) -> Bools:
-        """Per element, whether a relation leads on from its start and from its end."""
+        """Whether a relation leads on from each element's start and from its end."""
         onward = np.diff(self.successors.first) > 0
         return onward.reshape(-1, 2)[:, ::-1]
 
@@ -238,7 +238,7 @@ def network_of(track: SurveyedTrack, links: pl.DataFrame) -> Network:
 
 
 def _in_turn(first: np.ndarray, second: np.ndarray) -> np.ndarray:
-    """Of two columns the rows in turn."""
+    """Rows of two columns in turn."""
     return np.column_stack([first, second]).ravel()
 
 
@@ -255,6 +255,7 @@ def _linked_ends(track: SurveyedTrack, links: pl.DataFrame, side: str) -> tuple[
 
 def _onward(count: int, here: Ints, to: Ints, gap_m: Floats, forward: Bools, backward: Bools) -> Onward:
     """Relations in the order given; one given twice, or once from each side, counts once, with what either allows."""
+    # `here * count + to` is one number for each pair of ends.
     _, begins, same = np.unique(here * count + to, return_index=True, return_inverse=True)
     allowed = np.zeros((2, len(begins)), dtype=np.bool_)
     np.logical_or.at(allowed[0], same, forward)
@@ -275,7 +276,7 @@ def _oriented(track: SurveyedTrack, onward: Onward) -> Network:
 
 
 def connected_parts(count: int, here: Ints, there: Ints) -> Ints:
-    """Per place the number of the part that it is connected with, which is that of its first place.
+    """Number of the part that each place is connected with, which is that of its first place.
 
     Written out: the library for graphs takes longer to load than a run to replay.
     """

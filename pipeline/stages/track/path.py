@@ -324,7 +324,7 @@ class TravelledPath:
         return np.array([*self.track.ids, None], dtype=object)[element], measure
 
     def locate_index(self, leg: Ints, path_m: Floats) -> tuple[Ints, Floats]:
-        """As `locate`, the net element as its number in the track (-1: not known)."""
+        """Net element and measure as `locate`, the element as its number in the track (-1: not known)."""
         element = np.full(len(path_m), -1, dtype=np.int64)
         measure = np.full(len(path_m), np.nan)
         for index, route_leg in enumerate(self.legs):

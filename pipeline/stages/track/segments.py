@@ -160,7 +160,7 @@ def downhill(points: Points, line: Polyline, segment: Ints, line_of: Ints | None
 
 
 def on_segments(points: Points, line: Polyline, segment: Ints) -> Feet:
-    """Each point on its given segment, in the tangent plane of the point; `fraction` is not limited."""
+    """Projection of each point on its segment, in the point's tangent plane; `fraction` is not limited."""
     to_start = line.start.take(segment, axis=0) - points.surface
     to_end = line.end.take(segment, axis=0) - points.surface
     x = _dot(to_start, points.east)
@@ -177,7 +177,7 @@ def on_segments(points: Points, line: Polyline, segment: Ints) -> Feet:
 
 
 def held_to_line(feet: Feet, count: int) -> Feet:
-    """At a corner between two segments the vertex is nearest; only beyond the ends the line goes on."""
+    """Feet held to the line: at a corner the vertex is nearest; only beyond the ends the line goes on."""
     low = np.where(feet.segment == 0, -np.inf, 0.0)
     high = np.where(feet.segment == count - 1, np.inf, 1.0)
     fraction = np.clip(feet.fraction, low, high)

@@ -215,7 +215,7 @@ def in_pieces(track: SurveyedTrack) -> SurveyedTrack:
 
 
 def pieces_of(track: SurveyedTrack) -> list[list[slice]]:
-    """Per element the vertices of its pieces in order; neighbours share one.
+    """Vertices of each element's pieces in order; neighbours share one.
 
     A piece ends where it has turned by more than a right angle since its start.
     """
@@ -228,11 +228,12 @@ def pieces_of(track: SurveyedTrack) -> list[list[slice]]:
 
 
 def _cuts(track: SurveyedTrack) -> list[list[int]]:
-    """Per element the vertices between its pieces."""
+    """Vertices between the pieces of each element, each of which turns by less than a right angle in all."""
     owner, vertex = _spaced_vertices(track)
     along = np.diff(track.surface[vertex], axis=0)
     same_element = owner[:-1] == owner[1:]
     start = np.searchsorted(owner, np.arange(len(track.ids)))
+    # Only elements that turn by a right angle against their first segment can need a cut.
     turned = same_element & (np.einsum("ij,ij->i", along, along[np.minimum(start[owner[:-1]], len(along) - 1)]) < 0.0)
     cuts: list[list[int]] = [[] for _ in track.ids]
     for element in np.unique(owner[:-1][turned]).tolist():

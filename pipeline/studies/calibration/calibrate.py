@@ -137,7 +137,7 @@ def _monitored(
 
 
 def _alarms(log: RunLog, site: Site, vehicle: Vehicle, config: Configuration, solution: str) -> tuple[str, ...]:
-    """Of a replay without any noise given or measured: a fault must not pass for noise."""
+    """Alarms of a replay without any noise given or measured: a fault must not pass for noise."""
     replayed = replay(log, site, vehicle, _with_monitors(config, {**_AS_STATED, **_NO_NOISE}))
     return beyond_noise(replayed.epochs.filter(pl.col("solution") == solution), config.monitors.threshold_factor)
 
@@ -171,7 +171,7 @@ def calibration_of(runs: Sequence[Observed], vehicle: Vehicle, config: Configura
 
 
 def _loudest_noise_m(runs: Sequence[Observed]) -> dict[str, tuple[float, ...]]:
-    """By key of `[monitors]` the largest noise of all runs, monitor by monitor [m]."""
+    """Largest noise of all runs by key of `[monitors]` [m]."""
     names = sorted({name for run in runs for name in run.noise_m})
     shown = {name: [run.noise_m[name] for run in runs if name in run.noise_m] for name in names}
     return {name: tuple(np.max(noises_m, axis=0).tolist()) for name, noises_m in shown.items()}

@@ -85,7 +85,7 @@ def front_of(
     areas: pl.DataFrame | None = None,
     ahead_m: float = 0.0,
 ) -> Front:
-    """From the tables of one solution of one run; `ahead_m`: front end ahead of the balise antenna."""
+    """The front end from the tables of one solution of one run; `ahead_m`: its distance from the balise antenna."""
     path, direction, speed = (floats(epochs, name) for name in ("path_m", "direction", "speed_mps"))
     gnss = flags(epochs, "in_use") & np.isfinite(path)
     reported = _reported_m(epochs, passages)
@@ -139,7 +139,7 @@ def _judged(epochs: pl.DataFrame, limit_m: float) -> tuple[Bools, Bools, Bools]:
 
 
 def _latency_s(epochs: pl.DataFrame, run: dict[str, Any], config: Configuration) -> tuple[Floats, Floats]:
-    """By how much latency widens the interval behind and ahead of the estimate [s]; what is not known widens nothing.
+    """How much latency widens the interval behind and ahead of the estimate [s]; what is unknown widens nothing.
 
     A learned latency is not taken out of positions (DOMAIN 5.1), so the train may be ahead by it.
     """

@@ -42,7 +42,7 @@ class ClaimJourney:
     profile: RequirementProfile
 
     def tally(self, code: Ints, where: Bools, size: Floats | None = None) -> Tally:
-        """Of the epochs `where` a requirement applies, and of the gaps of the log that begin or end there."""
+        """Tally of the epochs `where` a requirement applies, and of the gaps of the log that begin or end there."""
         clock = self.front.clock
         without_data_s = self.front.without_data_s
         rows = np.flatnonzero(where | ((without_data_s > 0) & np.append(where[1:], False)))
@@ -276,7 +276,7 @@ def _speed(profile: RequirementProfile) -> list[Requirement]:
 
 
 def _of_windows(journey: ClaimJourney, code: Ints, where: Bools) -> Tally:
-    """Of windows of speed, and of the gaps of the log between them, in order of time."""
+    """Tally of windows of speed, and of the gaps of the log between them, in order of time."""
     speeds = journey.speeds
     gaps = np.flatnonzero(journey.front.without_data_s > 0)
     gap_s = journey.front.without_data_s[gaps]
@@ -349,6 +349,7 @@ def _availability(journey: ClaimJourney) -> Tally:
     held = front.clock.held_s * (np.cumsum(front.output) > 0)
     t_s = (front.clock.t_ns - front.clock.t_ns[:1]) / NS_PER_S
     until = np.cumsum(np.where(lost, held, 0.0))
+    # Time lost up to the begin of the window that ends at each epoch.
     before = np.concatenate(([0.0], until))[np.searchsorted(t_s, t_s - asked.within_s)]
     worst_s = float((until - before).max(initial=0.0))
     return replace(

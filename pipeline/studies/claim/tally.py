@@ -68,7 +68,7 @@ def count_claims(
     size: Floats | None = None,
     without_data_s: Floats | float = 0.0,
 ) -> Tally:
-    """Of the epochs of one run to which a requirement applies, in order of time; `run` draws its trial.
+    """Count the epochs of one run to which a requirement applies, in order of time; `run` draws its trial.
 
     `without_data_s`: how long the log holds nothing after each epoch's own time `held_s`; nobody knows what was then.
     """

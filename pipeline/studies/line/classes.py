@@ -106,7 +106,7 @@ def _by_frequency(names: pl.Series) -> str:
 
 
 def _judged(counted: pl.DataFrame, criteria: LineCriteria) -> pl.DataFrame:
-    """With bounds, class and cause: what was not judged counts against each bound."""
+    """Pieces with bounds, class and cause: what was not judged counts against each bound."""
     cases = counted.select(_TRIALS).unique()
     rows = [_shown(bad, number, wrong, unjudged, criteria) for bad, number, wrong, unjudged in cases.iter_rows()]
     shown = pl.DataFrame(rows, schema=_SHOWN, orient="row")

@@ -109,6 +109,7 @@ def laid_on(spans: pl.DataFrame, stretches: pl.DataFrame, pieces: Pieces) -> pl.
         begin = pieces.at(element, floats(kept, "low"))
         end = pieces.at(element, floats(kept, "high"))
         index = np.repeat(np.arange(kept.height), end - begin + 1)
+        # Number of each piece within its span.
         ahead = np.arange(len(index)) - np.repeat(np.cumsum(end - begin + 1) - (end - begin + 1), end - begin + 1)
         piece = begin[index] + ahead
         hit = kept[index].with_columns(piece=pl.Series(piece, dtype=pl.Int64))
@@ -220,7 +221,7 @@ def _merged(rows: pl.DataFrame) -> pl.DataFrame:
 
 
 def _explained(passes: pl.DataFrame, hits: pl.DataFrame, alarms: pl.DataFrame) -> pl.DataFrame:
-    """With the monitor that failed first in an alarm that began on the piece, and the satellites at the worst place."""
+    """Passes with the monitor that failed first in an alarm on the piece, and the satellites at the worst place."""
     keys = ["piece", "growing"]
     worst = hits.filter(pl.col("state") == pl.col("state").max().over(keys)).group_by(keys).agg(pl.min("satellites"))
     first = alarms.select(t="t_start", monitor=pl.col("monitors").list.first()).unique("t")

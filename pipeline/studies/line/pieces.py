@@ -48,7 +48,7 @@ class Pieces:
 
 
 def pieces_of(site: Site, piece_m: float) -> Pieces:
-    """Each element in equal pieces as near to `piece_m` as can be."""
+    """Elements cut into equal pieces, as near to `piece_m` as can be."""
     track = track_of(site.track)
     counts = np.maximum(1, np.rint(track.length_m / piece_m)).astype(np.int64)
     element = np.repeat(np.arange(len(counts)), counts)

@@ -325,7 +325,7 @@ def sensors_of(run: RunLog) -> list[tuple[str, pl.DataFrame]]:
 
 
 def follows_checks(run: RunLog, solution: str, config: Configuration) -> list[Check]:
-    """Each odometer against the positions of one solution of a cleaned run."""
+    """Checks of each odometer against the positions of one solution of a cleaned run."""
     fixes = run.gnss.filter(pl.col("solution") == solution)
     return [
         follows_check(name, follows_positions(frame, fixes, config), config.evidence) for name, frame in sensors_of(run)

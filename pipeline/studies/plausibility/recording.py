@@ -52,7 +52,7 @@ class Recording:
 
     @cached_property
     def pairs(self) -> dict[str, PairFit]:
-        """Each counter against the positions."""
+        """How each counter fits the positions, by its name."""
         return {name: fit_pair(self.gnss, counter) for name, counter in self.counters.items()}
 
     def seconds(self, frame: pl.DataFrame) -> Floats:

@@ -130,7 +130,7 @@ def seconds_since(epoch_ns: int, frame: pl.DataFrame) -> Floats:
 
 
 def _thinned(t_s: Floats) -> Ints:
-    """Of the rows some two a second."""
+    """Some two of the rows a second."""
     if t_s.size < 2 or np.median(np.diff(t_s)) >= 0.9 * _ROW_S:
         return np.arange(t_s.size)
     slot = np.floor((t_s - t_s[0]) / _ROW_S + 1e-6)

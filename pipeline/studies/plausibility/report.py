@@ -35,7 +35,7 @@ class FitReport:
     mending: Mapping[str, str] = field(default_factory=dict)
 
     def as_dict(self) -> dict[str, object]:
-        """For programs: what keeps the run from being replayed, every check, and the lines that mend it."""
+        """The report for programs: what keeps the run from being replayed, every check, and the lines that mend it."""
         mending = self.tables.get("Lines that mend it")
         mends = [] if mending is None else mending["toml"].to_list()
         return {

@@ -34,7 +34,7 @@ def allocation_table(config: SafetyConfig) -> pl.DataFrame:
 
 
 def levels_table(config: SafetyConfig) -> pl.DataFrame:
-    """Per service level its rate of hazards [1/h], and the published time allowed [s]."""
+    """Rate of hazards of each service level [1/h], and the published time allowed [s]."""
     rates = {level: service.hazard_rate_per_h for level, service in config.service_levels.items()}
     table = pl.DataFrame({"service_level": list(rates), "rate": list(rates.values())})
     return table.with_columns(detect_s=allowed_time_to_detect_s(config.thr_vb_per_h, pl.col("rate")))
@@ -112,7 +112,7 @@ def demands_table(config: SafetyConfig) -> pl.DataFrame:
 
 
 def substantiation_table(config: SafetyConfig) -> pl.DataFrame:
-    """Hours [h] that show a rate at 95 %, by events seen, for THR_VB and the rate of each service level."""
+    """Hours [h] that show a rate at 95 %, by number of events, for THR_VB and each service level's rate."""
     targets = {"THR_VB": config.thr_vb_per_h} | {
         f"signal in space, {level}": service.hazard_rate_per_h for level, service in config.service_levels.items()
     }

@@ -94,7 +94,7 @@ def lds_hazard_rate_per_h(hr_sbas_per_h: float, time_to_detect_s: float) -> floa
 
 
 def markov_table(config: SafetyConfig) -> pl.DataFrame:
-    """Per service level, each with its allowed T_D, at T_D and later: exact, numeric, approximated."""
+    """The model of each service level at its allowed T_D and later: exact, numeric, approximated."""
     rows = []
     for level, rate, allowed_s in levels_table(config).iter_rows():
         model = LdsModel(rate, config.diagnosis_hazard_rate_per_h, allowed_s / S_PER_H)

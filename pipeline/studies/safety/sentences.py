@@ -35,7 +35,7 @@ def reservations(runs: pl.DataFrame, alarms: pl.DataFrame) -> list[str]:
 
 
 def _unjudged(runs: pl.DataFrame, alarms: pl.DataFrame) -> list[str]:
-    """Per solution: the time and the alarms that nothing could judge."""
+    """Time and alarms of each solution that nothing could judge."""
     said = []
     done = runs.filter(pl.col("status") != RunStatus.FAILED).sort("solution")
     for (solution,), rows in done.group_by("solution", maintain_order=True):
@@ -59,7 +59,7 @@ def slow_receivers(levels: pl.DataFrame) -> list[str]:
 
 
 def level_statements(detection: pl.DataFrame) -> list[str]:
-    """Per solution: how many failures were in use no longer than each service level allows."""
+    """How many failures of each solution were in use no longer than each service level allows."""
     unknown = pl.col("failures") - pl.col("within") - pl.col("exceeded")
     failed = detection.filter(pl.col("failures") > 0).with_columns(unknown=unknown)
     said = []

@@ -211,7 +211,7 @@ def _redundant(first: _Diagnosed, second: _Diagnosed) -> Row:
 
 
 def _verdicts_in_table(fails: FailureLog, alarms: pl.DataFrame) -> list[Verdict]:
-    """Each alarm of the architecture has the verdict of the alarm of the replay that it began in."""
+    """Verdict of each alarm of the architecture: that of the replay's alarm that it began in."""
     spans = alarms.select(pl.col("t_start", "t_end").to_physical(), pl.col("verdict").cast(pl.String)).rows()
     return [
         next((Verdict(verdict) for start, end, verdict in spans if start <= span.start_ns <= end), Verdict.UNKNOWN)

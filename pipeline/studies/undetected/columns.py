@@ -105,7 +105,7 @@ def rows_of(monitored: MonitoredSolution) -> Watched:
 
 
 def windows_of(monitored: MonitoredSolution, rows: Watched) -> list[FaultWindow]:
-    """From each independent fix to the next."""
+    """Windows from each independent fix to the next."""
     prepared = monitored.prepared
     fixes = fixes_ns(
         prepared.run, monitored.lds.crossings, prepared.config.lds.starts_of_mission, prepared.config.undetected
@@ -157,7 +157,7 @@ def _in_use_m(monitored: MonitoredSolution, rows: Watched, parts: list[FaultWind
 
 
 def _range_m(monitored: MonitoredSolution, rows: Watched, parts: list[FaultWindow]) -> Floats:
-    """By the worst range at fault; NaN without ranges."""
+    """Error by the worst range at fault [m]; NaN without ranges."""
     satellites = monitored.prepared.ranges(monitored.solution.name)
     if satellites is None:
         return np.full((2, rows.rows), np.nan)

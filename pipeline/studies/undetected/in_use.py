@@ -6,7 +6,7 @@ held to the anchor; from there on it grows by what the restarted bank lets pass,
 
     unnoticed            f(k) <= U(k)
     held to anchor A     f(k) <= U(A) + b(A, k) - (x(k) - x(A))          x: GNSS minus odometer as recorded
-    after, since h       f(k) <= f(h) + sum over (h, k] of way_s (y - u), |averages| <= thresholds
+    after, since h       f(k) <= f(h) + sum over (h, k] of gain_s (y - u), |averages| <= thresholds
 
 The anchor is the fix (a telegram; the first TVB is taken to be no worse than that), or after an outage beyond
 `gap_reset_s` a TVB before it; which one, and when the alarm came, is open: the largest counts. Before anything was
@@ -44,7 +44,7 @@ class Returns:
 
     @classmethod
     def of(cls, rows: Watched, epochs: pl.DataFrame, scale_sigma: float) -> Returns:
-        """From the aligned epochs of the solution; `scale_sigma`: of the vehicle file [1]."""
+        """The rows of the aligned epochs of the solution; `scale_sigma`: of the vehicle file [1]."""
         path_m, odometer_m, sigma_m, travelled_m, doubt_m = (
             floats(epochs, name)[rows.epoch]
             for name in ("path_m", "odometer_m", "position_sigma_m", "travelled_m", "odometer_doubt_m")
@@ -52,7 +52,7 @@ class Returns:
         return cls(path_m - odometer_m, sigma_m, travelled_m, doubt_m, scale_sigma)
 
     def within(self, part: slice) -> Returns:
-        """At some of the rows."""
+        """The same at some of the rows."""
         return Returns(
             self.offset_m[part],
             self.sigma_m[part],
@@ -159,7 +159,9 @@ class _Window:
         return least
 
     def _grown_m(self, ended_m: Floats, average: int) -> Floats:
-        """By one average alone: way_s y = way_s / w (A_i - (1 - w) A_(i-1)), and each |A| within its threshold."""
+        """Growth by one average alone: gain_s y = gain_s / w (A_i - (1 - w) A_(i-1)), and each |A| within its
+        threshold.
+        """
         watched = self.watched
         led = ~watched.fresh
         # A restarted average is zero.

@@ -101,13 +101,15 @@ def _worst(part: Equations, threshold: Floats) -> tuple[Floats, Floats]:
 
 
 def _parabola(part: Equations) -> tuple[Floats, Floats, Floats]:
-    """SS (epochs,), and c and d of each satellite (epochs, satellites)."""
+    """SS, shape (epochs,), and c and d of each satellite, shape (epochs, satellites), as at the top of this file."""
     weighted = part.design * part.weight[..., None]
     normal = normal_of(part.design, part.weight, part.prior)
     inverse = np.linalg.inv(normal)
     right = np.einsum("eni,en->ei", weighted, part.residual_m)
     fitted = np.einsum("eni,eij,ej->en", part.design, inverse, right)
+    # With b added to satellite n the sum of squares is SS + 2 c_n b + d_n b^2; N = A' W A + prior:
     linear = part.weight * (part.residual_m - fitted)
+    # c_n = w_n (r_n - (A x)_n) above, d_n = w_n - w_n^2 (A N^-1 A')_nn.
     square = part.weight - np.einsum("eni,eij,enj->en", weighted, inverse, weighted)
     left = np.einsum("en,en->e", linear, part.residual_m)
     return left, linear, np.maximum(square, 0.0)

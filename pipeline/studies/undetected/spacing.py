@@ -42,7 +42,7 @@ def largest_spacing(rows: Watched, driven_m: Floats, config: Configuration) -> t
 
 
 def _first_rows_beyond(starts: list[int], rows: int, search: Callable[[int], int]) -> dict[int, int]:
-    """By start; where the run does not reach the limit from one, it does so from no later one."""
+    """First row beyond the limit from each start; if none is reached from one, none from later ones."""
     found: dict[int, int] = {}
     reached = True
     for start in starts:
