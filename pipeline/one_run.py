@@ -36,8 +36,20 @@ Channel = dict[str, tuple[Fit, Match]]
 def replay(run: RunLog, site: Site, vehicle: Vehicle | None = None, config: Configuration | None = None) -> RunTables:
     """Replay one recorded run: match, align, monitor, detect balises, judge, summarise.
 
-    `run` as `read_run` yields it, `site` as `read_site` does. A solution that cannot be replayed has a failed row and
-    leaves the others alone; raises `InputError` where none can be.
+    Args:
+        run: the run as `read_run` yields it.
+        site: the site as `read_site` yields it.
+        vehicle: antenna places [m], odometer scale [1] and latencies [s], as far as known; None: nothing is.
+        config: the configuration; None: the defaults.
+
+    Returns:
+        The five tables of the run; a solution that cannot be replayed has a failed row in `runs` and no other.
+
+    Raises:
+        InputError: no solution can be replayed.
+
+    Source:
+        DOMAIN sections 2 to 5; CONTRACT section 3.
     """
     prepared = prepare(run, site, vehicle or Vehicle(), config or Configuration(), clock_advice)
     evidence = prepared.evidence()
@@ -59,7 +71,21 @@ def replay(run: RunLog, site: Site, vehicle: Vehicle | None = None, config: Conf
 
 
 def monitor_alone(run: RunLog, site: Site, vehicle: Vehicle, config: Configuration, solution: str) -> MonitoredSolution:
-    """What the train made of one solution, without a judge: for studies of what the monitors could have seen."""
+    """What the train made of one solution, without a judge: for studies of what monitors could detect.
+
+    Args:
+        run: the run as `read_run` yields it.
+        site: the site.
+        vehicle: what is known of the vehicle.
+        config: the configuration.
+        solution: name of the solution.
+
+    Returns:
+        Alignment, monitors and detected balises, with the solution on its path.
+
+    Raises:
+        InputError: the run has no such solution, or it cannot be replayed.
+    """
     if solution not in run.solutions():
         raise InputError("has no such solution", place=run.run_id, found=solution, expected=", ".join(run.solutions()))
     prepared = prepare(run, site, vehicle, config, clock_advice)

@@ -63,10 +63,12 @@ class RunLog:
     other_odometers: tuple[pl.DataFrame, ...] = ()
 
     def stream(self, name: Stream) -> pl.DataFrame | None:
+        """One of its streams by name, or None."""
         frame: pl.DataFrame | None = getattr(self, name)
         return frame
 
     def with_streams(self, **streams: pl.DataFrame | None) -> RunLog:
+        """The run with some streams replaced."""
         return replace(self, **streams)  # type: ignore[arg-type]
 
     def solutions(self) -> list[str]:

@@ -31,12 +31,26 @@ _REASON_WORDS = pl.Series([reason.value for reason in REASONS] + [None], dtype=p
 
 
 def reason_words(reason: Ints) -> pl.Series:
-    """Numbers in `REASONS` as words, null for `NO_REASON`; shape (epochs,)."""
+    """Numbers of reasons as words, null for `NO_REASON`.
+
+    Args:
+        reason: numbers in `REASONS`, shape (n,).
+
+    Returns:
+        Words of n rows.
+    """
     return gathered(_REASON_WORDS, reason)
 
 
 def arrays_of(columns: type[Any]) -> tuple[str, ...]:
-    """The names of the arrays of such a class, in their order."""
+    """The names of the arrays of such a class, in their order.
+
+    Args:
+        columns: a frozen class with arrays.
+
+    Returns:
+        Names of attributes.
+    """
     return tuple(one.name for one in fields(columns) if one.type in ("Ints", "Floats", "Bools"))
 
 

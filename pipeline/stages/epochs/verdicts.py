@@ -49,10 +49,11 @@ class Verdicts:
 
     @property
     def fails(self) -> Bools:
+        """Epochs at which the monitor fails."""
         return np.asarray(self.state == FAIL)
 
     def without_passes(self, reason: NotEvaluated) -> Verdicts:
-        """Of a monitor that can find a fault, but not say that there is none."""
+        """Verdicts of a monitor that can find a fault, but not say that there is none."""
         void = self.state == PASS
         return Verdicts(
             value=np.where(void, np.nan, self.value),
@@ -100,10 +101,18 @@ def states_of(value: Floats, threshold: Floats, evaluated: Bools) -> States:
 
 
 def verdicts(value: Floats, threshold: Floats, reasons: Ints, state: States | None = None) -> Verdicts:
-    """The verdicts of a monitor; `reasons`: why it is not evaluated, `NO_REASON` where it is (`first_reason`).
+    """The verdicts of a monitor.
 
-    `state` where the monitor gives it already. Else what has no reason and yet no value or threshold is not
-    evaluated either: absence is never health.
+    What has no reason and yet no value or threshold is not evaluated either: absence is never health.
+
+    Args:
+        value: what is tested, in the unit of the monitor, shape (n,).
+        threshold: beyond it the monitor fails, shape (n,).
+        reasons: why it is not evaluated, by number, `NO_REASON` where it is (`first_reason`), shape (n,).
+        state: states by number, where the monitor gives them already, shape (n,).
+
+    Returns:
+        Verdicts of n rows, NaN where not evaluated.
     """
     unexplained = reasons == NO_REASON
     if state is None:
@@ -119,13 +128,13 @@ def verdicts(value: Floats, threshold: Floats, reasons: Ints, state: States | No
 
 
 def no_verdicts(epochs: int, reason: NotEvaluated) -> Verdicts:
-    """Of a monitor that has nothing to look at in the whole run."""
+    """Verdicts of a monitor that has nothing to look at in the whole run."""
     nothing = np.full(epochs, np.nan)
     return verdicts(nothing, nothing, np.full(epochs, NUMBER[reason]))
 
 
 def first_reason(*reasons: tuple[Bools, NotEvaluated | Ints]) -> Ints:
-    """Per epoch the first reason whose mask holds, `NO_REASON` where none does; a reason may be given per epoch."""
+    """The first reason whose mask holds at each epoch, or `NO_REASON`; a reason may be given per epoch."""
     first = np.full(reasons[0][0].shape, NO_REASON)
     for mask, reason in reversed(reasons):
         number = NUMBER[reason] if isinstance(reason, NotEvaluated) else reason
@@ -181,7 +190,17 @@ class FailureLog:
 
 
 def failure_log(t_ns: Ints, negated: Bools, monitors: Mapping[str, Verdicts], recovery_s: float) -> FailureLog:
-    """Of one solution's epochs, shape (epochs,); monitors that are not given were not evaluated."""
+    """Fails and alarms of one solution.
+
+    Args:
+        t_ns: stamps of its epochs in order [ns], shape (epochs,).
+        negated: where the LDS negated the position, shape (epochs,).
+        monitors: verdicts by the name of the monitor; those that are not given were not evaluated.
+        recovery_s: fails no farther apart are one alarm [s].
+
+    Returns:
+        Failing epochs with their first monitor, and the alarms.
+    """
     names = [name for name in MONITORS if name in monitors]
     failed = np.array([monitors[name].fails for name in names], dtype=np.bool_).reshape(len(names), t_ns.size)
     rows = np.flatnonzero(failed.any(axis=0))

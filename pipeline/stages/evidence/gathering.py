@@ -17,14 +17,14 @@ from pipeline.stages.evidence.anchors import (
     final_stands,
     on_clock,
     outside,
-    reference_ways,
+    reference_movements,
     shown_on_its_track,
     sided,
 )
 from pipeline.stages.evidence.carrying import (
-    Counter,
     Lags,
     RecorderClock,
+    SignedOdometer,
     TrueAnchor,
     clocks_of,
     lags_of,
@@ -66,7 +66,8 @@ def without_frozen(
     """The reference without samples that repeat the one before while an odometer moves on: any, or any independent one.
 
     A recorder that stands still says nothing of where the train is (DOMAIN section 5.0): after so long the stretch
-    ends. A train that stands repeats too: there the odometer shows no way beyond its dead band and the sample's noise.
+    ends. A train that stands repeats too: there the odometer shows no movement beyond its dead band and the sample's
+    noise.
     """
     witnesses = [odometer for odometer in odometers if odometer.independent] or list(odometers)
     if reference is None or reference.height < 2 or not witnesses:
@@ -119,8 +120,8 @@ def known_stretch(
         reads_ns = _confirming_ns(known, stretch, clock_m, reads, config.hazards.evidence_factor, most_m)
         steps = contradictions(known, side.stretch, witnesses, config)
         of_path = Levels.of(steps, t_ns, reads_ns)
-        levels.append(of_path.seen(side.sense))
-        opened = left_open(known, t_ns, steps, of_path, beyond.seen(side.sense))
+        levels.append(of_path.oriented(side.sense))
+        opened = left_open(known, t_ns, steps, of_path, beyond.oriented(side.sense))
         paths.append(opened)
         possible_ns |= set(_confirming_ns(opened, stretch, clock_m, reads, config.align.sure_sigmas, np.inf))
     disputed = _disputed(t_ns, reads, possible_ns)
@@ -150,7 +151,7 @@ def known_stretch(
 
 
 def _disputed(t_ns: Ints, reads: Sequence[TrueAnchor], possible_ns: set[int]) -> list[tuple[int, int]]:
-    """For each read within the stretch at which the train was on none of its paths: the time between its neighbours.
+    """The time between the neighbours of each read at which the train was on none of the stretch's paths.
 
     Which of the two was right nobody knows, nor since when: without end where no read confirms the reference.
     """
@@ -184,9 +185,9 @@ def _confirming_ns(
             continue
         at_m = np.interp([float(read.t_ns - t_ns[0])], since_ns, known.at_m)
         sample = int(np.searchsorted(t_ns, read.t_ns))
-        beside = slice(max(sample - 1, 0), sample + 1)
-        low_m = float(at_m[0] + (known.low_m - known.at_m)[beside].min())
-        high_m = float(at_m[0] + (known.high_m - known.at_m)[beside].max())
+        around = slice(max(sample - 1, 0), sample + 1)
+        low_m = float(at_m[0] + (known.low_m - known.at_m)[around].min())
+        high_m = float(at_m[0] + (known.high_m - known.at_m)[around].max())
         route = known.path.legs[int(known.path.leg[sample])]
         half_m = factor * float(np.hypot(stretch.sigma_m[sample], read.sigma_m))
         half_m += float(clock_m[sample]) + read.clock_m
@@ -197,7 +198,7 @@ def _confirming_ns(
     return sorted(confirming)
 
 
-# Numerics: ways over which two odometers are compared [s].
+# Numerics: movements over which two odometers are compared [s].
 _PARTED_S = 60.0
 
 
@@ -211,21 +212,34 @@ def evidence_of(
 ) -> TrainEvidence:
     """Everything that is known of where the train was, except from GNSS.
 
-    `reference`: as from `reference_stretches`; `recorders`: anchors of each other one, by its clock, in order of time;
-    `odometers`: that of the LDS first. Where any is independent, the others confirm nothing and narrow nothing; where
-    none is, what they carry proves nothing.
+    Where any odometer is independent, the others confirm nothing and narrow nothing; where none is, what they carry
+    proves nothing.
+
+    Args:
+        reference: stretches of the reference and spans off the track [ns], as from `reference_stretches`.
+        recorders: anchors of each other recorder of places, by its own clock, in order of time.
+        odometers: all odometers, that of the LDS first.
+        network: the track network, its elements not in pieces.
+        vehicle: the place of the GNSS antenna [m].
+        config: the configuration; used are `hazards`, `evidence`, `align`, `lds` and `matching`.
+
+    Returns:
+        The evidence, which is asked for any instants.
+
+    Source:
+        DOMAIN sections 5.0 and 5.1.
     """
     hazards = config.hazards
     independent = [odometer for odometer in odometers if odometer.independent]
-    counters = [Counter(odometer, config.hazards.limits.doubt_m) for odometer in independent or odometers]
+    counters = [SignedOdometer(odometer, config.hazards.limits.doubt_m) for odometer in independent or odometers]
     main = counters[0] if counters else None
     least_m = config.matching.orientation_distance_m
-    stretches, silent = reference
+    stretches, off_track = reference
     sides = [sided(stretch, main, least_m) for stretch in stretches]
-    facing = frozenset(side.facing for side in sides if abs(side.with_m - side.against_m) >= least_m)
+    oriented = frozenset(side.first_oriented for side in sides if abs(side.with_m - side.against_m) >= least_m)
     if any(min(side.with_m, side.against_m) >= least_m for side in sides):
         counters = [counter.without_sign() for counter in counters]
-    searches = [GapSearch(counter, network, config, facing) for counter in counters]
+    searches = [GapSearch(counter, network, config, oriented) for counter in counters]
     lags = [_lags_of_reference(stretches, search, least_m) for search in searches]
     # Any odometer contradicts a reference; where one is independent, the others are not asked.
     found = [Witness.of(*of_one, config) for of_one in zip(counters, lags, strict=True)]
@@ -242,7 +256,7 @@ def evidence_of(
     shift_ns = round(of_reference.shift_s * NS_PER_S)
     return TrainEvidence(
         stretches=known,
-        silent=tuple((begin_ns - shift_ns, end_ns - shift_ns) for begin_ns, end_ns in silent),
+        off_track=tuple((begin_ns - shift_ns, end_ns - shift_ns) for begin_ns, end_ns in off_track),
         carried=tuple(search.carried(_borders(known, search.counter, apart)) for search in searches),
         by_reads=tuple(search.carried(_points(clocked)) for search in searches) if recorded else (),
         reads_ns=np.array([anchor.t_ns for anchor in clocked], dtype=np.int64),
@@ -295,40 +309,42 @@ def _known_stretches(
 
 
 def _borders(
-    stretches: Sequence[KnownStretch], counter: Counter, reads: Sequence[TrueAnchor]
+    stretches: Sequence[KnownStretch], counter: SignedOdometer, reads: Sequence[TrueAnchor]
 ) -> list[tuple[TrueAnchor, TrueAnchor]]:
+    """First and last anchor of each stretch and of each read: between them nothing has to be carried."""
     return [*(stretch.ends(counter) for stretch in stretches), *_points(reads)]
 
 
 def _points(known: Sequence[TrueAnchor]) -> list[tuple[TrueAnchor, TrueAnchor]]:
+    """Anchors that last for an instant: first and last anchor are the same."""
     return [(anchor, anchor) for anchor in known]
 
 
 def _lags_of_reference(stretches: Sequence[ReferenceStretch], search: GapSearch, least_m: float) -> Lags:
     """Its clock against that of one odometer, in the sense in which that one counts.
 
-    One that counts up both ways is compared where the train cannot have turned.
+    One that counts up in both directions is compared where the train cannot have turned.
     """
     sides = [sided(stretch, search.counter, least_m) for stretch in stretches]
-    begin_ns, end_ns, way_m, sigma_m = reference_ways(sides, search.only_length_m)
-    way_m = way_m if search.counter.signed else np.abs(way_m)
-    return lags_of(begin_ns, end_ns, way_m, sigma_m, search.counter, search.config)
+    begin_ns, end_ns, moved_m, sigma_m = reference_movements(sides, search.only_length_m)
+    moved_m = moved_m if search.counter.signed else np.abs(moved_m)
+    return lags_of(begin_ns, end_ns, moved_m, sigma_m, search.counter, search.config)
 
 
 def _lags_of_anchors(source: Carried, config: Configuration) -> Lags:
-    """The clock of a recorder against an odometer's, by the ways between its anchors, whether they close or not."""
-    ways = [
+    """The clock of a recorder against an odometer's, by the distances between its anchors, closed or not."""
+    movements = [
         (gap.begin_ns, gap.end_ns, apart_m, float(np.linalg.norm([anchor.sigma_m for anchor in gap.anchors])))
         for gap in source.gaps
         for apart_m in gap.only_length_m
     ]
-    begins, ends, *lengths = zip(*ways, strict=True) if ways else ((), (), (), ())
-    way_m, sigma_m = (np.array(values, np.float64) for values in lengths)
-    return lags_of(np.array(begins, np.int64), np.array(ends, np.int64), way_m, sigma_m, source.counter, config)
+    begins, ends, *lengths = zip(*movements, strict=True) if movements else ((), (), (), ())
+    moved_m, sigma_m = (np.array(values, np.float64) for values in lengths)
+    return lags_of(np.array(begins, np.int64), np.array(ends, np.int64), moved_m, sigma_m, source.counter, config)
 
 
 def _parted(odometers: Sequence[Odometry], config: Configuration) -> bool:
-    """An odometer of unknown origin counts otherwise than an independent one, by more than 5 m + 5 % of a way."""
+    """An odometer of unknown origin counts otherwise than an independent one, by more than 5 m + 5 % of a distance."""
     independent = [odometer for odometer in odometers if odometer.independent]
     others = [odometer for odometer in odometers if odometer.origin is Origin.UNKNOWN and not odometer.follows_gnss]
     for other in others:
@@ -336,9 +352,9 @@ def _parted(odometers: Sequence[Odometry], config: Configuration) -> bool:
             begin_ns = max(other.begin_ns, witness.begin_ns)
             end_ns = min(other.end_ns, witness.end_ns)
             at_ns = np.arange(begin_ns, end_ns, round(_PARTED_S * NS_PER_S), dtype=np.int64)
-            ways = [np.abs(odometer.steps_m(at_ns)) for odometer in (other, witness)]
-            allowed_m = config.lds.odometer_fixed_m + config.lds.odometer_share * ways[1]
-            if (np.abs(ways[0] - ways[1]) > allowed_m).any():
+            moved_m = [np.abs(odometer.steps_m(at_ns)) for odometer in (other, witness)]
+            allowed_m = config.lds.odometer_fixed_m + config.lds.odometer_share * moved_m[1]
+            if (np.abs(moved_m[0] - moved_m[1]) > allowed_m).any():
                 return True
     return False
 
@@ -368,7 +384,15 @@ class TruePlaces:
 
 
 def true_places(evidence: EvidenceSet, track: SurveyedTrack) -> TruePlaces:
-    """Every net element that one of the alternatives touches, with the measures on it."""
+    """Every net element that one of the alternatives touches, with the measures on it.
+
+    Args:
+        evidence: where the train was, at n instants.
+        track: the survey, whose elements the evidence numbers.
+
+    Returns:
+        Net elements and measures [m] of n instants.
+    """
     parts = [_touched(alternative) for alternative in evidence.alternatives]
     row, element = (np.concatenate([np.zeros(0, np.int64), *(getattr(part, name) for part in parts)]) for name in _KEYS)
     ends_m = [np.concatenate([np.zeros(0), *(getattr(part, name) for part in parts)]) for name in ("low_m", "high_m")]
@@ -406,6 +430,7 @@ def _touched(there: Alternative) -> _Touched:
         np.maximum(np.searchsorted(route.entry_m, at_m, side="right") - 1, 0) for at_m in (there.low_m, there.high_m)
     )
     count = last - first + 1
+    # Each instant `count` times, and with it the visits from its first on.
     numbers = np.repeat(np.arange(there.rows.size), count)
     visit = np.repeat(first - np.concatenate([[0], np.cumsum(count)[:-1]]), count) + np.arange(count.sum())
     low = route.low_m[visit]

@@ -36,7 +36,7 @@ class FitReport:
     mending: Mapping[str, str] = field(default_factory=dict)
 
     def as_dict(self) -> dict[str, object]:
-        """For programs: what keeps the run from being replayed, every check, and the lines that mend it."""
+        """The report for programs: what keeps the run from being replayed, every check, and the lines that mend it."""
         mending = self.tables.get("Lines that mend it")
         mends = [] if mending is None else mending["toml"].to_list()
         return {
@@ -105,11 +105,13 @@ def fit_report(
 
 
 def _in_order(run: RunLog) -> RunLog:
+    """The run with its streams sorted by time, for a run that `clean` refuses."""
     streams: tuple[Stream, ...] = ("gnss", "odometer", "reference", "balise_reads")
     return run.with_streams(**{name: frame.sort("t") for name in streams if (frame := run.stream(name)) is not None})
 
 
 def _checks(fits: dict[str, Fit], counts: CleanCounts) -> pl.DataFrame:
+    """One row per check of each solution, with what cleaning left out."""
     columns = ("solution", "check", "state", "found", "cause")
     rows = [
         (name, check.what, check.state.value, check.found, check.cause)
@@ -161,6 +163,7 @@ def refuted(checks: list[Check]) -> bool:
 
 
 def _check(what: str, sigma_m: Floats, epochs: JudgedEpochs, counted: Bools, config: Configuration) -> Iterator[Check]:
+    """Whether a reported uncertainty agrees with the errors found."""
     low_m, high_m = epochs.judgements.low_m, epochs.judgements.high_m
     # What it leaves possible is the worst; healthy evidence strays by a part of that.
     strays_m = config.evidence.sigma_evidence_part * 0.5 * (high_m - low_m)

@@ -10,13 +10,14 @@ from schemas.frozen import frozen
 
 @frozen
 class Spacing:
-    """The shortest way and time from a physical balise, wherever it is thought to be, to an error beyond the limit.
+    """The shortest distance and time from a physical balise, wherever it is thought to be, to an error beyond the
+    limit.
 
     None where no start reaches the limit before the run ends. `starts`: balises thought of; `reached`: how many of them
     reach it.
     """
 
-    way_m: float | None = None
+    distance_m: float | None = None
     time_s: float | None = None
     starts: int = 0
     reached: int = 0
@@ -31,7 +32,7 @@ def undetected_figures(
     known = undetected.with_columns(larger=larger, **{name: pl.Series(values) for name, values in at.items()})
     known = known.filter(pl.col("in_use") & larger.is_not_null())
     figures: dict[str, object] = {
-        "physical_spacing_m": spacing.way_m,
+        "physical_spacing_m": spacing.distance_m,
         "physical_spacing_s": spacing.time_s,
         "physical_spacing_starts": spacing.starts,
         "physical_spacing_reached": spacing.reached,

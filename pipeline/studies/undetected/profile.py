@@ -48,8 +48,8 @@ def profile_at(monitored: MonitoredSolution, epoch: int, behind: bool) -> FaultP
         )
     against = behind != bool(ints(epochs["direction"], unknown=1)[epoch] < 0)
     part = rows.since(window.start, row, window.since_s)
-    seen = part.mirrored() if against else part
-    optimum = largest_profile(seen, MARGIN)
+    travel = part.mirrored() if against else part
+    optimum = largest_profile(travel, MARGIN)
     enabled = monitored.bank.along().enabled
     names = [name for name, on in zip(SCALES, enabled, strict=True) if on or name == "raw"]
     return FaultProfile(
@@ -58,9 +58,9 @@ def profile_at(monitored: MonitoredSolution, epoch: int, behind: bool) -> FaultP
         ),
         t=pl.Series("t", [window.since_ns, int(times_ns(epochs)[epoch])]).cast(pl.Datetime("ns", "UTC")),
         error_m=optimum.error_m,
-        bound_m=float(largest_errors(seen, monitored.prepared.config.undetected).most_m[-1]),
-        step_m=largest_of_shape(seen, "step"),
-        ramp_m=largest_of_shape(seen, "ramp"),
+        bound_m=float(largest_errors(travel, monitored.prepared.config.undetected).most_m[-1]),
+        step_m=largest_of_shape(travel, "step"),
+        ramp_m=largest_of_shape(travel, "ramp"),
         monitors=tuple(f"along_{names[which]}" if which >= 0 else "channel" for which in optimum.binding),
     )
 
