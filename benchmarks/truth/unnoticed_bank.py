@@ -93,7 +93,7 @@ def watched_of(offset_m: Floats, sigmas_m: Floats, alphas: Floats) -> Watched:
         fresh=fresh,
         free=series.border,
         fastest_m=5.0 * second,
-        way_s=second,
+        gain_s=second,
         rate_mps=series.rate_mps,
         least_mps=np.maximum(-limit[:, 0], series.rate_mps - 5.0),
         most_mps=np.minimum(limit[:, 0], series.rate_mps + 5.0),

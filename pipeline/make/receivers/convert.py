@@ -44,7 +44,7 @@ class Converted:
     parts: tuple[LogPart, ...] = ()
 
     def made_of(self, logs: Sequence[FileDigest]) -> Converted:
-        """The run with the logs that were read for it, beside those that it was made of before."""
+        """The run with the logs that were read for it, and those that it was made of before."""
         listed = dict.fromkeys([*self.run.notes.raw_logs, *((log.name, log.size_bytes, log.sha256) for log in logs)])
         return replace(self, run=replace(self.run, notes=replace(self.run.notes, raw_logs=tuple(listed))))
 
@@ -54,7 +54,19 @@ class Converted:
 
 
 def convert(logs: list[Path], run_id: str, config: IngestConfig | None = None) -> Converted:
-    """Receiver logs of one journey as one new run: `gather` and `as_run`."""
+    """Receiver logs of one journey as one new run: `gather` and `as_run`.
+
+    Args:
+        logs: files of one journey.
+        run_id: id of the run.
+        config: the section `ingest` of the configuration; None: the defaults.
+
+    Returns:
+        The run, and what was left out.
+
+    Raises:
+        InputError: no log holds an epoch.
+    """
     return as_run(gather(logs, config), run_id)
 
 
@@ -65,7 +77,21 @@ def as_run(
     sigmas: FixSigma | None = None,
     correct: Sequence[StreamCorrection] = (),
 ) -> Converted:
-    """A new run of what logs hold, positions as `purpose` says, corrected; raises `InputError` without positions."""
+    """Make a new run of what logs hold.
+
+    Args:
+        logs: what the logs hold, as `gather` yields it.
+        run_id: id of the run.
+        purpose: which stream the positions become; None: `gnss`.
+        sigmas: standard deviations by kind of fix, where a log states none [m].
+        correct: corrections of streams.
+
+    Returns:
+        The run, and what was left out.
+
+    Raises:
+        InputError: the logs hold no position.
+    """
     streams = assigned(logs.streams, purpose or Purpose(), sigmas or FixSigma())
     if "gnss" not in streams:
         raise InputError(
@@ -90,7 +116,23 @@ def extended(
     force: bool,
     correct: Sequence[StreamCorrection] = (),
 ) -> Converted:
-    """A run that stands at a place, with what logs hold added to it; both are corrected first."""
+    """Add what logs hold to a run; both are corrected first.
+
+    Args:
+        run: the run as it stands.
+        place: its path, for errors.
+        logs: what the logs hold, as `gather` yields it.
+        purpose: which stream the positions become.
+        sigmas: standard deviations by kind of fix, where a log states none [m].
+        force: replace streams that the run has already.
+        correct: corrections of streams.
+
+    Returns:
+        The run with the streams added, and what was left out.
+
+    Raises:
+        InputError: the run has a stream already, or its corrections differ.
+    """
     streams = assigned(logs.streams, purpose, sigmas)
     notes = IngestNotes(corrections=logs.corrections_as(purpose))
     bare = RunLog(run.run_id, run.gnss.clear(), notes=notes).with_streams(**streams)
@@ -109,13 +151,13 @@ def extended(
 def _refuse_unlike(
     one: Sequence[StreamCorrection], other: Sequence[StreamCorrection], stream: Stream, place: Path
 ) -> None:
-    """Rows of one stream that were corrected in different ways could not be told apart."""
+    """Refuse rows of one stream that were corrected in different ways: nothing would distinguish them."""
     if one != other:
-        ways = [", ".join(made.changes for made in held) or "none" for held in (one, other)]
+        changes = [", ".join(made.changes for made in held) or "none" for held in (one, other)]
         raise InputError(
             f"receivers of one {stream} with different corrections",
             place=str(place),
-            found=" and ".join(ways),
+            found=" and ".join(changes),
             remedy="Convert them with one configuration; `solution` in [[ingest.correct]] names which it is for.",
         )
 
@@ -137,7 +179,7 @@ class Gatherings:
     topics: tuple[str, ...] = ()
 
     def corrections_as(self, purpose: Purpose) -> tuple[StreamCorrection, ...]:
-        """Those of the streams as they are meant: positions that become the reference are no stream `gnss` any more."""
+        """Corrections of the streams as they are meant: positions that become the reference are no `gnss` any more."""
         lost = BY_SOLUTION if purpose.stream == "reference" else ()
         return tuple(made for made in self.corrections if made.stream not in lost)
 
@@ -151,11 +193,19 @@ def gathered_of(run: RunLog, dropped: Mapping[str, int]) -> Gatherings:
 def gather(
     logs: list[Path], config: IngestConfig | None = None, date: date | None = None, solution: str | None = None
 ) -> Gatherings:
-    """What the logs hold: positions, or whatever else a mapping or a topic makes a stream of.
+    """Read what the logs hold.
 
-    `date`: the day of the first sentence, for NMEA logs that hold none. `solution`: the talker or device that is meant,
-    where a log holds the positions of two receivers. Raises `InputError` where no log of a receiver
-    holds an epoch, or where two logs tell of the same time under one solution.
+    Args:
+        logs: files, packed or not.
+        config: the section `ingest` of the configuration; None: the defaults.
+        date: the day of the first sentence, for NMEA logs that hold none.
+        solution: the talker or device that is meant, where a log holds the positions of two receivers.
+
+    Returns:
+        Streams of positions, or whatever else a mapping or a topic makes a stream of, and what was left out.
+
+    Raises:
+        InputError: no log of a receiver holds an epoch, or two logs hold the same time under one solution.
     """
     dropped: Counter[str] = Counter()
     parts: list[tuple[Path, Gatherings]] = []
@@ -220,11 +270,19 @@ class UnknownError(InputError):
 
 
 def said_of(reason: str) -> str:
-    """What became of the records of a reason: some are told and used all the same."""
+    """What became of the records set apart for a reason: some are noted and used all the same.
+
+    Args:
+        reason: why records were set apart.
+
+    Returns:
+        `noted` or `not used`.
+    """
     return "noted" if re.search(r"\((kept|put right)", reason) else "not used"
 
 
 def _reasons(dropped: Mapping[str, int]) -> str:
+    """What was not used, and why, for people."""
     return "".join(f" Not used: {reason} ({count})." for reason, count in sorted(dropped.items()))
 
 
@@ -278,7 +336,7 @@ def _refuse_overlaps(parts: list[tuple[Path, Gatherings]]) -> None:
 
 
 def _spans(log: Path, frame: pl.DataFrame, key: str, columns: tuple[str, ...]) -> Iterator[pl.DataFrame]:
-    """From when to when a log holds values, by recorder; a frame for each of the columns."""
+    """Times from when to when a log holds values, by recorder; a frame for each of the columns."""
     named = frame if key in frame.columns else frame.with_columns(pl.lit("primary").alias(key))
     for column in columns or ("t",):
         if column in named.columns:
@@ -288,6 +346,7 @@ def _spans(log: Path, frame: pl.DataFrame, key: str, columns: tuple[str, ...]) -
 
 
 def _convert_one(log: Path, config: IngestConfig, date: date | None, solution: str | None) -> Gatherings:
+    """What one file of a receiver gives."""
     if is_bag(log):
         # Corrections are made of the whole, once.
         own = of_topics(config, log)
@@ -367,8 +426,8 @@ def _read(
 
 def _no_epoch(content: bytes, log: Path, dropped: Mapping[str, int]) -> InputError:
     """What there is in place of positions tells what to change at the receiver."""
-    met = Counter(name_of(frame) for frame in frames(content, lambda: None))
-    if not met:
+    counts = Counter(name_of(frame) for frame in frames(content, lambda: None))
+    if not counts:
         head = content[:_HEAD]
         hint = next((hint for pattern, hint in _ALMOST.items() if re.search(pattern, head)), _OTHER)
         return UnknownError(
@@ -380,7 +439,7 @@ def _no_epoch(content: bytes, log: Path, dropped: Mapping[str, int]) -> InputErr
     return NoEpochError(
         "no epoch with a time and a position",
         place=str(log),
-        found=", ".join(f"{name} ({count})" for name, count in met.most_common(_MOST_NAMES)),
+        found=", ".join(f"{name} ({count})" for name, count in counts.most_common(_MOST_NAMES)),
         expected="UBX NAV-PVT, SBF PVTGeodetic or PVTCartesian, NMEA GGA, GNS or RMC with a date, "
         "NovAtel BESTPOS or INSPVA",
         remedy="Let the receiver record one of these messages, or give the day of NMEA without one by --date."

@@ -30,6 +30,7 @@ class Difference:
 
     @property
     def place(self) -> str:
+        """`table.column`, or the table alone."""
         return f"{self.table}.{self.column}" if self.column else self.table
 
     def __str__(self) -> str:
@@ -39,11 +40,20 @@ class Difference:
 def compare_tables(
     a: pl.DataFrame, b: pl.DataFrame, contract: type[dy.Schema], keys: tuple[str, ...] = (), rules: Rules = NO_RULES
 ) -> list[Difference]:
-    """The differences of `b` against `a`; none means the same.
+    """The differences of one table against another.
 
-    Rows are compared as they stand, or by `keys` where given, so that one row more is one
-    difference. A column without a tolerance in rules or contract is compared exactly. NaN, which no
-    table may hold, is always a difference.
+    By `keys`, one row more is one difference. A column without a tolerance in rules or contract is compared exactly.
+    NaN, which no table may hold, is always a difference.
+
+    Args:
+        a: table of the first result.
+        b: table of the second one.
+        contract: schema with the tolerance of each column, in the unit of the column.
+        keys: columns by which rows are paired; empty: as they stand.
+        rules: what may differ.
+
+    Returns:
+        The differences, none where the tables are the same.
     """
     name = contract.__name__.lower()
     a, b = (rules.left(name, frame) for frame in (a, b))
@@ -118,6 +128,7 @@ def _values_differ(a: pl.Series, b: pl.Series, tolerance: float) -> tuple[str, i
 
 
 def _text(value: object) -> str:
+    """A value for people."""
     if value is None:
         return "null"
     if isinstance(value, pl.Series):

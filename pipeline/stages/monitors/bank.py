@@ -37,7 +37,7 @@ from pipeline.stages.monitors.axis import (
     time_steps,
 )
 from pipeline.stages.monitors.noise import OF_WALK, OF_WHITE_NOISE, NoiseMeter
-from pipeline.stages.odometry.driven import under_way
+from pipeline.stages.odometry.driven import is_moving
 from pipeline.stages.odometry.odometry import Increments
 from schemas.arrays import Bools, Floats, Ints
 from schemas.config import Configuration, MonitorConfig
@@ -63,7 +63,7 @@ class Axis:
 
 
 def along_axis(epochs: AlignedEpochs, config: Configuration) -> Axis:
-    """DIAG eq. 1-3."""
+    """GNSS minus odometer along the track (DIAG eq. 1-3); arguments as of `axes_of`."""
     t_s = (epochs.t_ns - epochs.t_ns[0]) * 1e-9
     matched = _match_reasons(epochs)
     reasons = otherwise(matched, epochs.odometer_reason)
@@ -72,7 +72,18 @@ def along_axis(epochs: AlignedEpochs, config: Configuration) -> Axis:
 
 
 def axes_of(epochs: AlignedEpochs, config: Configuration) -> tuple[Axis, Axis, Axis]:
-    """DIAG eq. 1-3 and 10-15."""
+    """The three axes of the bank.
+
+    Args:
+        epochs: aligned epochs of one solution, arrays of shape (n,).
+        config: the configuration.
+
+    Returns:
+        Along, across the track and up.
+
+    Source:
+        DIAG eq. 1-3 and 10-15.
+    """
     t_s = (epochs.t_ns - epochs.t_ns[0]) * 1e-9
     matched = _match_reasons(epochs)
     up_reasons = otherwise(matched, first_reason((np.isnan(epochs.vertical_m), NO_HEIGHT)))
@@ -86,13 +97,13 @@ def axes_of(epochs: AlignedEpochs, config: Configuration) -> tuple[Axis, Axis, A
 
 
 def _moving(epochs: AlignedEpochs, t_s: Floats, config: Configuration) -> Bools:
-    """By the odometer: noise of the rows at a stand is no way driven."""
-    way_m = epochs.travelled_m
+    """Whether the train moves, by the odometer: noise of its rows at a stand is no distance driven."""
+    travelled_m = epochs.travelled_m
     deadband_mps = config.matching.deadband_mps
-    known = np.isfinite(way_m)
+    known = np.isfinite(travelled_m)
     if not known.any():
         return np.asarray(np.abs(np.nan_to_num(epochs.speed_mps)) > deadband_mps)
-    return under_way(t_s, np.interp(t_s, t_s[known], way_m[known]), deadband_mps, config.align.speed_window_s)
+    return is_moving(t_s, np.interp(t_s, t_s[known], travelled_m[known]), deadband_mps, config.align.speed_window_s)
 
 
 def _match_reasons(epochs: AlignedEpochs) -> Ints:
@@ -102,6 +113,7 @@ def _match_reasons(epochs: AlignedEpochs) -> Ints:
 
 
 def _along(epochs: AlignedEpochs, t_s: Floats, reasons: Ints, config: Configuration) -> AxisSeries:
+    """The epochs that are compared along the track, and what they are compared by."""
     rows = np.flatnonzero(reasons == NO_REASON)
     at_rows = AlongEpochs(
         epoch=rows,
@@ -126,7 +138,7 @@ def _across(
     """Cross-track or vertical; the chord error of a coarse survey is one more correlated source."""
     rows = np.flatnonzero(reasons == NO_REASON)
     dt, fresh = time_steps(t_s[rows], config.align.gap_reset_s)
-    element = epochs.netelement_id.rle_id().to_numpy()[rows]
+    visit = np.cumsum(np.diff(epochs.element, prepend=epochs.element[:1]) != 0)[rows]
     survey = np.nan_to_num(epochs.survey_sigma_m[rows], nan=config.matching.survey_sigma_default_m)
     if axis == "cross":
         position_m, sigma_m, digits_m = epochs.cross_track_m, epochs.calibrated_cross_m, epochs.digits_cross_m
@@ -134,7 +146,7 @@ def _across(
         position_m, sigma_m, digits_m = epochs.vertical_m, epochs.calibrated_up_m, epochs.digits_up_m
     coarse = digits_m[rows], np.ones(rows.size)
     # Mostly there is at most one of them.
-    beside = [
+    further = [
         source
         for source in (_chord_error(epochs, rows), _wander(epochs, rows, config.monitors), coarse)
         if source[0].any()
@@ -142,10 +154,10 @@ def _across(
     return AxisSeries(
         epoch=rows,
         fresh=fresh,
-        border=np.diff(element, prepend=element[:1]) != 0,
+        border=np.diff(visit, prepend=visit[:1]) != 0,
         dt_s=dt,
         rate_mps=_steps(position_m[rows]) / dt,
-        **errors_of(sigma_m[rows], dt, beside, config.monitors),
+        **errors_of(sigma_m[rows], dt, further, config.monitors),
         white_m2=np.zeros(rows.size),
         border_m2=2.0 * survey**2,
         lasting_mps=_turned_mps(epochs, rows) if axis == "cross" else np.zeros((rows.size, 0)),
@@ -159,7 +171,7 @@ def _turned_mps(epochs: AlignedEpochs, rows: Ints) -> Floats:
 
 
 def _wander(epochs: AlignedEpochs, rows: Ints, config: MonitorConfig) -> Source:
-    """How the survey's error changes along the elements [m], and its decorrelation over the way of each step.
+    """How the survey's error changes along the elements [m], and its decorrelation over the distance of each step.
 
     A 2-D survey of no stated accuracy wanders; a stated sigma is constant in place, unless configured otherwise.
     """
@@ -171,22 +183,25 @@ def _wander(epochs: AlignedEpochs, rows: Ints, config: MonitorConfig) -> Source:
         stated_m = np.zeros(survey.size)
         length_m = config.survey_wander_length_m
     error = np.where(unstated, config.survey_wander_m, stated_m)
-    return error, -np.expm1(-_way_m(epochs, rows) / np.where(unstated, config.survey_wander_length_m, length_m))
+    return error, -np.expm1(-_path_steps_m(epochs, rows) / np.where(unstated, config.survey_wander_length_m, length_m))
 
 
 def _chord_error(epochs: AlignedEpochs, rows: Ints) -> Source:
+    """How far chords lie off their curve [m], and its decorrelation over the distance of each step."""
     error = np.nan_to_num(epochs.interpolation_error_m[rows])
     curvature = np.abs(np.nan_to_num(epochs.curvature_per_m[rows]))
     length = np.sqrt(8.0 * error / np.maximum(curvature, _STRAIGHT_PER_M))  # chord of an arc with this sagitta
-    return error, -np.expm1(-_way_m(epochs, rows) / np.maximum(length, 1.0))
+    return error, -np.expm1(-_path_steps_m(epochs, rows) / np.maximum(length, 1.0))
 
 
-def _way_m(epochs: AlignedEpochs, rows: Ints) -> Floats:
+def _path_steps_m(epochs: AlignedEpochs, rows: Ints) -> Floats:
+    """Distance along the path from the row before [m], 0 at the first."""
     path_m = np.nan_to_num(epochs.path_m[rows])
     return np.abs(np.diff(path_m, prepend=path_m[:1]))
 
 
 def _steps(values: Floats) -> Floats:
+    """Differences from the row before, 0 at the first; shape (n,)."""
     return np.diff(values, prepend=values[:1])
 
 
@@ -245,6 +260,7 @@ class AxisBank:
         return int(rows[self._done]) - 1 if self._done < rows.size else self.value.shape[0] - 1
 
     def _store(self, part: AxisSeries, value: Floats, threshold: Floats, noise_m: Floats) -> None:
+        """Write what was evaluated of some rows into the arrays by epoch."""
         present = ~part.fresh[:, None] & self.enabled[None, :]
         # One noise too large, and the axis has a blind spot: none of its monitors says that all is well.
         known: Bools = np.all((noise_m <= self._config.noise_limit_m) | ~self.enabled.any(), axis=1)
@@ -284,12 +300,12 @@ class AxisBank:
         return float(known[-1]) * WHITE_PART if known.size else None
 
     def median_noise_m(self) -> tuple[float, ...]:
-        """By monitor; empty where it never was known."""
+        """Median noise at each of the lags [m]; empty where it never was known."""
         known = self.noise_m[np.isfinite(self.noise_m).all(axis=1)]
         return tuple(np.median(known, axis=0).tolist()) if known.size else ()
 
     def verdicts(self) -> dict[str, Verdicts]:
-        """Of the monitors of this axis by name, as far as they are evaluated."""
+        """Verdicts of the monitors of this axis by name, as far as they are evaluated."""
         unknown = np.zeros(self.value.shape[0], dtype=np.bool_)
         unknown[self.series.epoch] = np.isnan(self.noise_m[self.series.epoch]).any(axis=1)
         too_large: Bools = np.any(self.noise_m > self._config.noise_limit_m, axis=1)
@@ -314,9 +330,17 @@ class MonitorBank:
     """The bank as the location determination system sees it: monitors of one solution, from the last restart on.
 
     Epochs are rows of the solution's epochs. Answers for an epoch may change with `freeze` or `restart` at or before
-    it, never through later ones. `single`: monitors without memory. `watched`: epochs with a row along the track. A
-    fail of any monitor is an alarm. `blind_along`: why those along the track cannot say that all is well, if they
-    cannot: an odometer made of the positions agrees with them whatever they say (DOMAIN section 5.0).
+    it, never through later ones. `watched`: epochs with a row along the track. A fail of any monitor is an alarm.
+
+    Args:
+        epochs: aligned epochs of the solution, arrays of shape (n,).
+        single: verdicts of the monitors without memory, by name, each of n rows.
+        config: the configuration.
+        blind_along: why those along the track cannot say that all is well, None where they can: an odometer made of the
+            positions agrees with them whatever they say (DOMAIN section 5.0).
+
+    Source:
+        DIAG eq. 1-17; DOMAIN section 3.
     """
 
     def __init__(
@@ -346,6 +370,7 @@ class MonitorBank:
         self._known_to = -1
 
     def _look(self, epoch: int) -> None:
+        """Evaluate all axes up to this epoch at least, and note what the LDS asks for."""
         if epoch <= self._known_to:
             return
         begin = self._known_to + 1
@@ -358,9 +383,11 @@ class MonitorBank:
         self._along[part] = self._axes[0].state[part, 0] != NOT_EVALUATED
 
     def _look_to_the_end(self) -> None:
+        """Look at all epochs given so far."""
         self._look(self._count - 1)
 
     def failed(self, epoch: int) -> bool:
+        """A monitor of the bank fails at this epoch."""
         self._look(epoch)
         return bool(self._any[epoch])
 
@@ -385,8 +412,16 @@ class MonitorBank:
         first = int(ahead.argmax())
         return epoch + (first if ahead[first] else ahead.size)
 
+    def hidden_until(self, epoch: int, end: int) -> int:
+        """The first epoch from `epoch` on, at most `end`, at which the fast noise is known or something fails."""
+        self._look(epoch)
+        part = slice(epoch, min(self._known_to + 1, end))
+        shown = self._noise_known[part] | self._any[part]
+        first = int(shown.argmax())
+        return epoch + (first if shown[first] else shown.size)
+
     def along_evaluated_between(self, epoch: int, end: int) -> Bools:
-        """Of epochs for which `quiet_until` answered."""
+        """Whether the axis along is evaluated at epochs for which `quiet_until` answered."""
         return self._along[epoch:end]
 
     def noise_known_at(self, epoch: int) -> bool:
@@ -406,6 +441,7 @@ class MonitorBank:
         self._known_to = min(self._known_to, epoch)
 
     def restart(self, epoch: int) -> None:
+        """Begin anew at this epoch, as after a gap: nothing but the measured noise is kept."""
         for axis in self._axes:
             axis.restart(epoch)
         self._known_to = epoch - 1
@@ -426,7 +462,7 @@ class MonitorBank:
         return {name: noise_m for name, noise_m in shown.items() if noise_m}
 
     def verdicts(self) -> dict[str, Verdicts]:
-        """Of each monitor of the bank by name, in the order of the columns of `epochs`."""
+        """Verdicts of each monitor of the bank by name, in the order of the columns of `epochs`."""
         self._look_to_the_end()
         return {name: found for axis in self._axes for name, found in axis.verdicts().items()} | self._single
 
