@@ -19,7 +19,7 @@ from datasets.inject import Recording
 from pipeline.one_run import monitor_alone
 from pipeline.stages.epochs.clock import Clock, holds, unambiguous
 from pipeline.stages.evidence import TrainEvidence
-from pipeline.stages.judge.judge import Judged, judge
+from pipeline.stages.judge.judge import judge
 from pipeline.stages.judge.judgement import JudgeInput
 from pipeline.stages.monitored import MonitoredSolution
 from pipeline.stages.prepare import require_independent_odometer
@@ -168,19 +168,14 @@ def baseline_of(run: RunLog, site: Site, vehicle: Vehicle, bank: Bank, solution:
             expected="a run as it was recorded",
         )
     monitored = monitor_alone(run, site, vehicle, bank.config, solution)
-    # Along the track the experiment would measure how well the positions agree with themselves, or nothing at all.
-    require_independent_odometer(monitored.prepared)
-    evidence = monitored.prepared.evidence()
-    judged = _judged(monitored, evidence)
-    return Baseline(run, site, bank, monitored, evidence, judged.epochs.table, judged.alarms, Recording(run, site))
-
-
-def _judged(monitored: MonitoredSolution, evidence: TrainEvidence) -> Judged:
     prepared = monitored.prepared
-    reference = prepared.run.reference
-    return judge(
+    # Along the track the experiment would measure how well the positions agree with themselves, or nothing at all.
+    require_independent_odometer(prepared)
+    evidence, reference = prepared.evidence(), prepared.run.reference
+    judged = judge(
         JudgeInput(monitored.solution, evidence, monitored.odometry, prepared.vehicle, prepared.config, reference)
     )
+    return Baseline(run, site, bank, monitored, evidence, judged.epochs.table, judged.alarms, Recording(run, site))
 
 
 @frozen
