@@ -123,7 +123,7 @@ def runs_by_hand() -> pl.DataFrame:
             }
             for number, (detected, way, first, failure, unsafe, linking, times) in enumerate(rows)
         ],
-        schema=module._SCHEMA,
+        schema=module._MONITORS_SCHEMA,
     )  # fmt: skip
 
 
