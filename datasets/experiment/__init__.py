@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 class Experiment:
     """Writes its tables into a folder and returns what it wrote; its own size where no repetitions are given.
 
-    The module of its name has `REPETITIONS`, `made(repetitions, seed, jobs, config)`, which gives the contents of the
+    The module of its name has `REPETITIONS`, `run(repetitions, seed, jobs, config)`, which gives the contents of the
     files by name, and `SETTINGS`, if something is fixed beyond that. `configured`: it judges the bank of a
     configuration; a published experiment has the paper's settings, and silently ignoring others would mislead.
     """
@@ -58,7 +58,7 @@ class Experiment:
         count = repetitions or module.REPETITIONS
         settings = {"experiment": self.name, "repetitions": count, "seed": seed} | getattr(module, "SETTINGS", {})
         noise = {} if recorded is None else {"recorded": recorded}
-        return write(out, module.made(count, seed, jobs, config, **noise), settings)
+        return write(out, module.run(count, seed, jobs, config, **noise), settings)
 
 
 EXPERIMENTS: dict[str, Experiment] = {

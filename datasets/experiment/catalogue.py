@@ -72,8 +72,8 @@ JOURNEYS: dict[Journey, JourneyPlan] = {
 
 
 @frozen
-class Stage:
-    """A journey made ready: its scenario and line, built once for all faults."""
+class PreparedJourney:
+    """A journey with its scenario and line, built once for all faults."""
 
     plan: JourneyPlan
     scenario: Scenario
@@ -95,7 +95,7 @@ class Stage:
         return self.first_ns + round(self.plan.onset_s * 1e9)
 
 
-def stage(plan: JourneyPlan, seed: int, rate_hz: float) -> Stage:
+def prepare_journey(plan: JourneyPlan, seed: int, rate_hz: float) -> PreparedJourney:
     """Line, train and receiver: GPS as `primary`, GPS + Galileo as `dual`; scale and latency known."""
     length_m = SPEED_MPS * plan.span_s + 3_000.0
     count = int((length_m - _FIRST_BALISE_M) // _BALISES_EVERY_M)
@@ -135,7 +135,7 @@ def stage(plan: JourneyPlan, seed: int, rate_hz: float) -> Stage:
         "runs": [{"id": "run", "motion": _motion(plan)}],
     }
     scenario = Scenario.model_validate(spec)
-    return Stage(plan, scenario, build_line(scenario.line))
+    return PreparedJourney(plan, scenario, build_line(scenario.line))
 
 
 def _motion(plan: JourneyPlan) -> dict[str, object]:
@@ -151,32 +151,32 @@ def _balise(number: int, plan: JourneyPlan) -> dict[str, object]:
     return {"id": name, "at_m": at_m, "kind": "physical" if physical else "virtual"}
 
 
-def with_fault(ready: Stage, fault: CatalogueFault) -> tuple[RunLog, Site]:
+def with_fault(prepared: PreparedJourney, fault: CatalogueFault) -> tuple[RunLog, Site]:
     """The journey with the fault from its onset on; the noise is that of the healthy one."""
-    placed = [{**one, "start_s": ready.plan.onset_s + float(str(one["start_s"]))} for one in fault.injected]
-    run_spec = ready.scenario.runs[0]
+    placed = [{**one, "start_s": prepared.plan.onset_s + float(str(one["start_s"]))} for one in fault.injected]
+    run_spec = prepared.scenario.runs[0]
     spec = type(run_spec).model_validate({**run_spec.model_dump(exclude={"faults"}), "faults": placed})
-    scenario = ready.scenario.model_copy(update={"runs": (spec,)})
-    run = build_run(scenario, spec, ready.line)
-    site = build_site(scenario, ready.line)
-    if ready.plan.physical_every:
-        run = run.with_streams(balise_reads=_reads(ready))
+    scenario = prepared.scenario.model_copy(update={"runs": (spec,)})
+    run = build_run(scenario, spec, prepared.line)
+    site = build_site(scenario, prepared.line)
+    if prepared.plan.physical_every:
+        run = run.with_streams(balise_reads=_reads(prepared))
     if fault.change is None:
         return run, site
-    return fault.change(run, site, ready.onset_ns, fault.size)
+    return fault.change(run, site, prepared.onset_ns, fault.size)
 
 
-def _reads(ready: Stage) -> pl.DataFrame:
+def _reads(prepared: PreparedJourney) -> pl.DataFrame:
     """When the antenna is over each physical balise."""
-    motion = build_motion(ready.scenario.runs[0].motion)
+    motion = build_motion(prepared.scenario.runs[0].motion)
     end_m = float(motion.chainage_m(np.array([motion.duration_s]))[0])
-    passed = [one for one in ready.scenario.line.balises if one.kind.value == "physical" and one.at_m < end_m]
-    times = [ready.first_ns + round(motion.time_at(one.at_m) * 1e9) for one in passed]
+    passed = [one for one in prepared.scenario.line.balises if one.kind.value == "physical" and one.at_m < end_m]
+    times = [prepared.first_ns + round(motion.time_at(one.at_m) * 1e9) for one in passed]
     table = pl.DataFrame({"t": times, "balise_id": [one.id for one in passed]})
     return BaliseReads.validate(table.with_columns(pl.col("t").cast(pl.Datetime("ns", "UTC"))), cast=True)
 
 
-def made(repetitions: int, seed: int, jobs: int, config: Configuration | None = None) -> Contents:
+def run(repetitions: int, seed: int, jobs: int, config: Configuration | None = None) -> Contents:
     """`catalogue` by fault, `monitors` by fault and monitor, `runs`, and `catalogue.md`."""
     runs = run_catalogue(repetitions, seed, jobs, config, catalogue())
     faults = faults_table(runs)
@@ -215,37 +215,37 @@ def _replayed(
 ) -> list[Row]:
     """One journey with one noise, and each of the faults that go into it."""
     journey, number = task
-    ready = stage(JOURNEYS[journey], 1_000 * seed + number, RATE_HZ)
-    healthy = replay(*with_fault(ready, CatalogueFault("healthy", 0.0, "")), ready.vehicle, config)
+    prepared = prepare_journey(JOURNEYS[journey], 1_000 * seed + number, RATE_HZ)
+    healthy = replay(*with_fault(prepared, CatalogueFault("healthy", 0.0, "")), prepared.vehicle, config)
     rows = []
     for fault in (one for one in faults if one.journey == journey):
-        tables = healthy if fault.is_healthy else replay(*with_fault(ready, fault), ready.vehicle, config)
+        tables = healthy if fault.is_healthy else replay(*with_fault(prepared, fault), prepared.vehicle, config)
         rows.append(
             {"fault": fault.name, "kind": fault.kind, "size": fault.size, "unit": fault.unit}
             | {"journey": journey, "repetition": number}
-            | judged(ready, tables, None if fault.is_healthy else healthy, config)
+            | judged(prepared, tables, None if fault.is_healthy else healthy, config)
         )
     return rows
 
 
-def judged(ready: Stage, tables: RunTables, healthy: RunTables | None, config: Configuration) -> Row:
+def judged(prepared: PreparedJourney, tables: RunTables, healthy: RunTables | None, config: Configuration) -> Row:
     """What one replay shows of the fault; times from its onset.
 
     `seen_s`: by monitor when it first failed; `first`: those that failed at the first of these epochs, the largest
     over its threshold first. Without a healthy replay every failure counts. `failure_s`: first epoch with an
     along-track error beyond the limit. `unsafe`: balises accepted beyond it.
     """
-    epochs = _from_onset(tables.epochs, ready)
+    epochs = _from_onset(tables.epochs, prepared)
     without_fault = healthy.epochs if healthy is not None else tables.epochs.clear()
-    failed_s = _first_fails(epochs, _from_onset(without_fault, ready))
+    failed_s = _first_fails(epochs, _from_onset(without_fault, prepared))
     detected_s = min(failed_s.values(), default=None)
     beyond = epochs.filter(pl.col("error_along_m").abs() > config.hazards.limits.failure_m)
     return {
         "detected_s": detected_s,
-        "way_m": None if detected_s is None else _travelled_m(ready, detected_s),
+        "way_m": None if detected_s is None else _travelled_m(prepared, detected_s),
         "first": _failed_first(epochs, failed_s, detected_s),
         "failure_s": beyond["since_s"][0] if beyond.height else None,
-        "unsafe": _unsafe(tables, ready, config) - (_unsafe(healthy, ready, config) if healthy else 0),
+        "unsafe": _unsafe(tables, prepared, config) - (_unsafe(healthy, prepared, config) if healthy else 0),
         "linking_errors": _linking_errors(tables) - (_linking_errors(healthy) if healthy else 0),
         "seen_s": [failed_s.get(monitor) for monitor in MONITORS],
         "budget_s": config.budget_s,
@@ -253,8 +253,8 @@ def judged(ready: Stage, tables: RunTables, healthy: RunTables | None, config: C
     }
 
 
-def _from_onset(epochs: pl.DataFrame, ready: Stage) -> pl.DataFrame:
-    since = (pl.col("t").dt.timestamp("ns") - ready.onset_ns) / 1e9
+def _from_onset(epochs: pl.DataFrame, prepared: PreparedJourney) -> pl.DataFrame:
+    since = (pl.col("t").dt.timestamp("ns") - prepared.onset_ns) / 1e9
     return epochs.filter(pl.col("solution") == _SOLUTION).with_columns(since_s=since).filter(pl.col("since_s") >= 0.0)
 
 
@@ -282,22 +282,22 @@ def _failed_first(epochs: pl.DataFrame, failed_s: dict[str, float], detected_s: 
     return sorted(first, key=lambda monitor: -abs(row[f"{monitor}_value"]) / row[f"{monitor}_threshold"])
 
 
-def _travelled_m(ready: Stage, since_s: float) -> float:
+def _travelled_m(prepared: PreparedJourney, since_s: float) -> float:
     """Distance of the train from the onset to the detection [m]."""
-    motion = build_motion(ready.scenario.runs[0].motion)
-    begin_s = ready.plan.onset_s
+    motion = build_motion(prepared.scenario.runs[0].motion)
+    begin_s = prepared.plan.onset_s
     at = motion.distance_m(pl.Series([begin_s, begin_s + since_s]).to_numpy())
     return float(at[1] - at[0])
 
 
-def _unsafe(tables: RunTables, ready: Stage, config: Configuration) -> int:
+def _unsafe(tables: RunTables, prepared: PreparedJourney, config: Configuration) -> int:
     """Virtual balises accepted from the onset on with an error beyond the limit."""
     wrong = (pl.col("status") == "accepted") & (pl.col("location_error_m").abs() > config.hazards.limits.failure_m)
     return tables.passages.filter(
         (pl.col("solution") == _SOLUTION)
         & wrong
         & (pl.col("kind") == "virtual")
-        & (pl.col("t_offered").dt.timestamp("ns") >= ready.onset_ns)
+        & (pl.col("t_offered").dt.timestamp("ns") >= prepared.onset_ns)
     ).height
 
 

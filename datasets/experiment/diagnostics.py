@@ -35,7 +35,7 @@ _BLOCK_REPETITIONS = 256
 _PMD_POINTS = 81
 
 
-def made(repetitions: int, seed: int, jobs: int, config: Configuration | None = None) -> Contents:
+def run(repetitions: int, seed: int, jobs: int, config: Configuration | None = None) -> Contents:
     """`pmd`, `detection`, `geometry` and pictures of the experiment."""
     frames = run_diagnostics(repetitions, seed, jobs)
     return {**frames, **drawn_figures(frames["pmd"], frames["detection"], frames["geometry"])}

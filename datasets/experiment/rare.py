@@ -56,7 +56,7 @@ _LASTING = 1.5
 _Bank = tuple[Constellation, LinearBank]
 
 
-def made(
+def run(
     repetitions: int, seed: int, jobs: int, config: Configuration | None = None, recorded: Path | None = None
 ) -> Contents:
     """`missed`, `transients`, `false_alarms`, `pseudorange`; `repetitions` are the sampled runs.

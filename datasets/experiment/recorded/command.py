@@ -83,7 +83,7 @@ class Inputs:
 
 
 @frozen
-class Made:
+class ExperimentResult:
     """The tables by name, the runs that could not be used, with the reason, and what was written, the page first."""
 
     tables: dict[str, pl.DataFrame]
@@ -140,7 +140,7 @@ def recorded_experiment(
     solution: str,
     jobs: int,
     say: Callable[[str], None] = _ignore,
-) -> Made:
+) -> ExperimentResult:
     """Run the experiment; what is in `out` of the same inputs is not made again. Writes tables, pictures and a page.
 
     `say` gets the text of how many injections there are, and how long they will take, before the first of them.
@@ -153,7 +153,7 @@ def recorded_experiment(
     inputs = _inputs(runs, site, vehicle, config, solution, plan, banks_of(plan, plan_file, config))
     # An earlier call may have found other runs at these addresses.
     _KEPT.clear()
-    surveyed = _each_once(mapped(_survey, [(inputs, run) for run in inputs.runs], jobs))
+    surveyed = _without_copies(mapped(_survey, [(inputs, run) for run in inputs.runs], jobs))
     rooms = [one.room for one in surveyed if one.room is not None]
     if not rooms:
         raise next(one.error for one in surveyed if one.error is not None)
@@ -163,11 +163,11 @@ def recorded_experiment(
     digests = {one.run_id: one.run_digest for one in surveyed}
     onsets = numbered(cells, drawn)
     pieces = _pieces(inputs, onsets, digests, out)
-    say(_ahead(onsets, pieces, surveyed, len(inputs.banks), jobs))
-    tables = _tables(mapped(_made_piece, pieces, jobs), surveyed, cells, plan, [bank.name for bank in inputs.banks])
+    say(_estimate(onsets, pieces, surveyed, len(inputs.banks), jobs))
+    tables = _tables(mapped(_replay_piece, pieces, jobs), surveyed, cells, plan, [bank.name for bank in inputs.banks])
     files = _write(out, tables, plan)
-    _forget_others(pieces, out)
-    return Made(tables, {one.run_id: str(one.error) for one in surveyed if one.error is not None}, files)
+    _remove_others(pieces, out)
+    return ExperimentResult(tables, {one.run_id: str(one.error) for one in surveyed if one.error is not None}, files)
 
 
 def _inputs(
@@ -213,7 +213,7 @@ def _survey(task: tuple[Inputs, tuple[str, str]]) -> _Surveyed:
     )
 
 
-def _ahead(
+def _estimate(
     onsets: Sequence[Onset], pieces: Sequence[_Piece], surveyed: Sequence[_Surveyed], banks: int, jobs: int
 ) -> str:
     """How much there is to do: each injection takes as long as its run did without a fault."""
@@ -231,7 +231,7 @@ def _unusable(run_id: str, error: InputError) -> _Surveyed:
     return _Surveyed(run_id, row, error=error)
 
 
-def _each_once(surveyed: Sequence[_Surveyed]) -> list[_Surveyed]:
+def _without_copies(surveyed: Sequence[_Surveyed]) -> list[_Surveyed]:
     """A copy of a run is no further pass, and no further hour."""
     first: dict[str, str] = {}
     kept = []
@@ -327,7 +327,7 @@ def _piece(inputs: Inputs, address: str, bank: Bank, onsets: Sequence[Onset], ru
     return _Piece(inputs, address, bank, tuple(onsets), out / _PIECES / f"{name}.parquet")
 
 
-def _made_piece(piece: _Piece) -> Part:
+def _replay_piece(piece: _Piece) -> Part:
     """Replay the injections of a piece, or read what an earlier call made of them."""
     content = storage.content_of(piece.file)
     if content is not None:
@@ -374,12 +374,12 @@ def _tables(
         "cells": of_cells,
         "pmd": pmd_table(injections, banks, cells, plan),
         "places": places_table(injections, cells, plan),
-        "banks": banks_table(injections, [_together(name, surveyed) for name in banks], of_cells, plan),
+        "banks": banks_table(injections, [_sum_over_runs(name, surveyed) for name in banks], of_cells, plan),
         "runs": conform(pl.DataFrame(runs, schema=dtypes(ExperimentRuns)), ExperimentRuns),
     }
 
 
-def _together(bank: str, surveyed: Sequence[_Surveyed]) -> FaultFree:
+def _sum_over_runs(bank: str, surveyed: Sequence[_Surveyed]) -> FaultFree:
     """All runs without a fault, as this bank saw them."""
     parts = [part for one in surveyed for part in one.fault_free if part.bank == bank]
     sums = {name: sum(getattr(part, name) for part in parts) for name in ("hours", "alarms", "tvb_s", "recorded_s")}
@@ -398,7 +398,7 @@ def _write(out: Path, tables: dict[str, pl.DataFrame], plan: RecordedPlan) -> li
     return [out / name for name in contents]
 
 
-def _forget_others(pieces: Sequence[_Piece], out: Path) -> None:
+def _remove_others(pieces: Sequence[_Piece], out: Path) -> None:
     """Pieces of other plans, or of other inputs, go."""
     kept = {piece.file.name for piece in pieces}
     for file in (out / _PIECES).glob("*.parquet"):
@@ -415,7 +415,7 @@ def _own_digest() -> str:
     return digest.hexdigest()
 
 
-def shown(made: Made) -> dict[str, pl.DataFrame]:
+def shown(made: ExperimentResult) -> dict[str, pl.DataFrame]:
     """What the screen shows: cells that were replayed, and banks."""
     cells = made.tables["cells"].filter(pl.col("injections") > 0)
     return {"Cells": cells.select(_SHOWN), "Banks": made.tables["banks"].select(_SHOWN_OF_BANKS)}

@@ -35,7 +35,7 @@ _AMOUNTS = {
 """Per kind its list in the plan, the quantity of the fault, and its unit."""
 _LISTS = ("rates_mps", "sizes_m", "durations_s", "latencies_s", "scales")
 _SIGNED = (FaultKind.RAMP, FaultKind.STEP, FaultKind.BIAS)
-_WAYS = {
+_DIRECTIONS = {
     "along": ("ahead", "behind"),
     "cross": ("left", "right"),
     "up": ("up", "down"),
@@ -198,8 +198,8 @@ def _cells(plan: RecordedPlan, fault: PlannedFault, limit_m: float) -> Iterator[
         for sign in signs:
             target = SATELLITE if fault.target == SATELLITE else fault.spec(amount, 1.0, "G01").target
             words = [fault.kind.value, target, f"{amount:g} {fault.unit}"]
-            way = _direction(fault, target, sign)
-            words += [] if way is None else [way]
+            direction = _direction(fault, target, sign)
+            words += [] if direction is None else [direction]
             words += [f"for {fault.duration_s:g} s"] if fault.duration_s is not None else []
             words += [f"in {fault.solution}"] if fault.solution is not None else []
             yield Cell(
@@ -214,7 +214,7 @@ def _cells(plan: RecordedPlan, fault: PlannedFault, limit_m: float) -> Iterator[
 def _direction(fault: PlannedFault, target: str, amount: float) -> str | None:
     if fault.kind not in _SIGNED:
         return None
-    more, less = _WAYS.get(target, ("longer", "shorter"))
+    more, less = _DIRECTIONS.get(target, ("longer", "shorter"))
     return more if amount > 0.0 else less
 
 
