@@ -19,11 +19,10 @@ from pipeline.studies.plausibility.fit import Fit, clock_advice, required_fit, w
 from pipeline.studies.plausibility.report import accuracy_checks, refuted
 from pipeline.studies.undetected.columns import Undetected, unnoticed_of
 from schemas.config import Configuration, Vehicle
-from schemas.conform import conform
+from schemas.conform import shaped
 from schemas.enums import Reason
 from schemas.errors import InputError
 from schemas.run import RunLog, RunTables, Site
-from schemas.stages import EpochFigures
 from schemas.tables import TABLES
 
 Tables = dict[str, pl.DataFrame]
@@ -55,8 +54,7 @@ def replay(run: RunLog, site: Site, vehicle: Vehicle | None = None, config: Conf
             parts.append(_failed(prepared, solution, error))
     if len(errors) == len(parts):
         raise errors[0]
-    # Each part was brought to the contract when it was made.
-    whole = {name: pl.concat([part[name] for part in parts]) for name in TABLES}
+    whole = {name: pl.concat([part[name] for part in parts]) if len(parts) > 1 else parts[0][name] for name in TABLES}
     return RunTables(run_id=run.run_id, **whole)
 
 
@@ -100,16 +98,18 @@ def _of_solution(prepared: PreparedRun, solution: str, channel: Channel, evidenc
     unnoticed = unnoticed_of(monitored)
     judged = judge(_case(monitored, unnoticed, evidence, fit.leaps_s(evidence.in_step)))
     results = _results(monitored, judged, unnoticed, fit, evidence)
-    epochs = judged.epochs.with_columns(*results.lost.columns(), monitored.solution.fixes["satellites"])
+    suspect = pl.Series("suspect_after_the_fact", judged.suspect_after_the_fact)
+    of_fixes = monitored.solution.fixes["satellites"]
+    columns = (suspect, *results.lost.columns(), of_fixes, *unnoticed.epochs)
     tables = {
         "hazards": judged.hazards,
         "passages": judged.passages,
         "alarms": judged.alarms,
-        "epochs": epochs,
+        "epochs": pl.DataFrame([*judged.epochs.contract_series(), *columns]),
         "runs": summarise(results, prepared.config, prepared.provenance),
     }
     # Judged epochs have more columns than the contract: those end here.
-    return {name: conform(table, TABLES[name]) for name, table in tables.items()}
+    return {name: shaped(table, TABLES[name]) for name, table in tables.items()}
 
 
 def _case(
@@ -118,9 +118,8 @@ def _case(
     """The solution before the judge."""
     replayed = monitored.solution
     run = monitored.prepared.run
-    epochs = pl.concat([replayed.epochs, unnoticed.epochs], how="horizontal")
     return JudgeInput(
-        solution=replace(replayed, epochs=epochs, passages=replayed.passages.with_columns(unnoticed.passages)),
+        solution=replace(replayed, passages=replayed.passages.with_columns(unnoticed.passages)),
         evidence=evidence,
         odometry=monitored.odometry,
         vehicle=monitored.prepared.vehicle,
@@ -141,7 +140,6 @@ def _results(
     fit = with_checks(fit, accuracy)
     counts = prepared.counts.solutions[monitored.solution.name]
     odometry = prepared.odometry
-    epochs = EpochFigures.of_table(judged.epochs)
     columns = {
         "vehicle": prepared.figures_from,
         "faults_injected": run.faults is not None and run.faults.height > 0,
@@ -169,9 +167,9 @@ def _results(
     }
     return SolutionResults(
         solution=monitored.solution.name,
-        epochs=epochs,
-        lost=lost_columns(epochs, prepared.config),
+        lost=lost_columns(judged.epochs, prepared.config),
         judged=judged,
+        undetected=unnoticed.epochs,
         columns=columns,
         ingest=run.notes,
         notes=[*fit.notes, *notes_of_replay(monitored, evidence)],
@@ -183,11 +181,11 @@ def _results(
 
 def _track_assumed(judged: Judged) -> bool:
     """Positions in use or accepted balises would be right if the survey held the train's track."""
-    used = judged.epochs.select((pl.col("in_use") & pl.col("track_assumed")).any()).item()
-    return bool(used or judged.offers.select((pl.col("accepted") & pl.col("track_assumed")).any()).item())
+    used = judged.epochs.in_use & judged.epochs.judgements.track_assumed
+    return bool(used.any() or (judged.offers.accepted & judged.offers.judged.track_assumed).any())
 
 
 def _failed(prepared: PreparedRun, solution: str, error: InputError) -> Tables:
     """A solution without content but for the row that says why."""
     nothing = {name: table.create_empty() for name, table in TABLES.items()}
-    return nothing | {"runs": conform(failed_row(str(error), prepared.provenance, solution), TABLES["runs"])}
+    return nothing | {"runs": shaped(failed_row(str(error), prepared.provenance, solution), TABLES["runs"])}

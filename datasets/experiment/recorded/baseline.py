@@ -151,7 +151,7 @@ def baseline_of(run: RunLog, site: Site, vehicle: Vehicle, bank: Bank, solution:
     require_independent_odometer(monitored.prepared)
     evidence = monitored.prepared.evidence()
     judged = _judged(monitored, evidence)
-    return Baseline(run, site, bank, monitored, evidence, judged.epochs, judged.alarms, Recording(run, site))
+    return Baseline(run, site, bank, monitored, evidence, judged.epochs.table, judged.alarms, Recording(run, site))
 
 
 def _judged(monitored: MonitoredSolution, evidence: TrainEvidence) -> Judged:

@@ -9,11 +9,11 @@ from datasets.experiment.recorded.baseline import Baseline
 from datasets.experiment.recorded.draw import Onset
 from datasets.experiment.recorded.injection import Injected
 from datasets.experiment.tables import Row
-from pipeline.stages.epochs.clock import holds, reactions_ns, unambiguous
+from pipeline.stages.epochs.clock import reactions_ns
+from pipeline.stages.epochs.monitored import MonitoredEpochs
 from pipeline.stages.judge.epochs import time_in_use
-from pipeline.stages.judge.judgement import RIGHT, UNKNOWN, WRONG
-from schemas.arrays import NS_PER_S, Bools, Floats, Ints, flags, floats, ints, runs_of, times_ns
-from schemas.enums import MonitorState
+from pipeline.stages.judge.judged import RIGHT, UNKNOWN, WRONG
+from schemas.arrays import NS_PER_S, Bools, Floats, Ints, flags, floats, ints, runs_of
 from schemas.frozen import frozen
 from schemas.tables import MONITORS, SCALES
 
@@ -32,8 +32,7 @@ class Watch:
     of the fault.
     """
 
-    epochs: pl.DataFrame
-    t_ns: Ints
+    epochs: MonitoredEpochs
     moved_m: Floats
     low_m: Floats
     high_m: Floats
@@ -41,16 +40,20 @@ class Watch:
     doubtful: Bools
     begin: int
 
+    @property
+    def t_ns(self) -> Ints:
+        return self.epochs.t_ns
+
 
 def outcome_row(base: Baseline, onset: Onset, found: Injected) -> Row:
     """The row of `schemas.experiment.Injections`, but for the bank."""
     watch = _watch(base, onset, found)
     after = watch.t_ns >= onset.t_ns
-    alarm = flags(watch.epochs, "alarm") & after
+    alarm = watch.epochs.alarm & after
     noticed_ns = int(watch.t_ns[alarm.argmax()]) if alarm.any() else None
     failure_ns, may_ns = _failure(watch)
     use = time_in_use(watch.epochs, watch.code, base.config)
-    in_use = flags(use, "in_use") & after
+    in_use = use.in_use & after
     delays_ns = reactions_ns(watch.t_ns, watch.t_ns, base.config)
     stopped_from = np.inf if noticed_ns is None else noticed_ns + int(delays_ns[alarm.argmax()])
     unnoticed = after if noticed_ns is None else after & (watch.t_ns < noticed_ns)
@@ -66,9 +69,9 @@ def outcome_row(base: Baseline, onset: Onset, found: Injected) -> Row:
         "time_to_failure_may_s": _seconds(may_ns, onset.t_ns),
         "time_since_failure_s": _seconds(noticed_ns, failure_ns),
         "time_since_failure_may_s": _seconds(noticed_ns, may_ns),
-        "stopped": _stopped(watch, flags(use, "in_use"), stopped_from) if noticed_ns is not None else None,
-        "hazardous_s": float(floats(use, "wrong_s")[after].sum()),
-        "hazardous_may_s": float(floats(use, "used_s")[after & (watch.code != RIGHT)].sum()),
+        "stopped": _stopped(watch, use.in_use, stopped_from) if noticed_ns is not None else None,
+        "hazardous_s": float(use.wrong_s[after].sum()),
+        "hazardous_may_s": float(use.used_s[after & (watch.code != RIGHT)].sum()),
         "unnoticed_m": _largest(watch.moved_m, unnoticed),
         "in_use_m": _largest(watch.moved_m, in_use),
         "tvb_lost_s": _tvb_lost_s(base, watch, onset, found.end_ns),
@@ -79,12 +82,11 @@ def outcome_row(base: Baseline, onset: Onset, found: Injected) -> Row:
 def _watch(base: Baseline, onset: Onset, found: Injected) -> Watch:
     lead_ns = onset.t_ns - round(_LEAD_S * NS_PER_S)
     epochs = found.monitored.solution.epochs
-    all_ns = times_ns(epochs)
-    epochs = epochs.filter(pl.Series(all_ns >= lead_ns))
-    t_ns = times_ns(epochs)
+    epochs = epochs.where(np.flatnonzero(epochs.t_ns >= lead_ns))
+    t_ns = epochs.t_ns
     row = np.searchsorted(base.t_ns, t_ns).clip(max=base.t_ns.size - 1)
     same = base.t_ns[row] == t_ns
-    moved_m, astray = _moved_m(base, found, epochs, row)
+    moved_m, astray = _moved_m(base, epochs.element_by(base.monitored.match.path.track.index), epochs.measure_m, row)
     moved_m = np.where(same, moved_m, np.nan)
     own_low_m, own_high_m = (values[row] for values in base.own_m)
     low_m = own_low_m + moved_m
@@ -94,18 +96,18 @@ def _watch(base: Baseline, onset: Onset, found: Injected) -> Watch:
     with np.errstate(invalid="ignore"):
         code[(low_m >= -limit_m) & (high_m <= limit_m)] = RIGHT
         code[(low_m > limit_m) | (high_m < -limit_m)] = WRONG
-    code[astray & holds(epochs, unambiguous())] = WRONG
+    code[astray & epochs.unambiguous] = WRONG
     was_right = (own_low_m >= -limit_m) & (own_high_m <= limit_m)
     doubtful = (code == UNKNOWN) & np.isfinite(moved_m) & (was_right | (np.abs(moved_m) > limit_m))
-    return Watch(epochs, t_ns, moved_m, low_m, high_m, code, doubtful, int(np.searchsorted(t_ns, onset.t_ns)))
+    return Watch(epochs, moved_m, low_m, high_m, code, doubtful, int(np.searchsorted(t_ns, onset.t_ns)))
 
 
-def _moved_m(base: Baseline, found: Injected, epochs: pl.DataFrame, row: Ints) -> tuple[Floats, Bools]:
-    """By what the position lies further along the fault-free run's path [m]; and where it lies off that path."""
+def _moved_m(base: Baseline, number: Ints, measure_m: Floats, row: Ints) -> tuple[Floats, Bools]:
+    """By what positions lie further along the fault-free run's path [m]; and where they lie off that path.
+
+    `number`: of the net element, -1 for none; `row`: the epoch of the fault-free run.
+    """
     path = base.monitored.match.path
-    element = epochs["netelement_id"].replace_strict(path.track.index, default=-1, return_dtype=pl.Int64)
-    number = element.fill_null(-1).to_numpy()
-    measure_m = floats(epochs, "measure_m")
     near_m = floats(base.epochs, "path_m")[row]
     leg = ints(base.epochs["leg"], 0)[row]
     at_m = np.full(number.size, np.nan)
@@ -141,8 +143,7 @@ def _stopped(watch: Watch, in_use: Bools, from_ns: float) -> bool:
 
 
 def _failing(watch: Watch, epoch: int) -> list[str]:
-    states = watch.epochs.row(epoch, named=True)
-    return [name for name in MONITORS if states.get(f"{name}_state") == MonitorState.FAIL.value]
+    return [name for name in MONITORS if watch.epochs.verdicts[name].fails[epoch]]
 
 
 def _largest(moved_m: Floats, where: Bools) -> float:
@@ -153,20 +154,21 @@ def _tvb_lost_s(base: Baseline, watch: Watch, onset: Onset, end_ns: int) -> floa
     """Time with a TVB in the fault-free run less that with the fault, over the watch [s]."""
     there = (base.t_ns >= onset.t_ns) & (base.t_ns <= end_ns) & flags(base.epochs, "tvb")
     had = set(base.t_ns[there].tolist())
-    has = set(watch.t_ns[(watch.t_ns >= onset.t_ns) & flags(watch.epochs, "tvb")].tolist())
+    has = set(watch.t_ns[(watch.t_ns >= onset.t_ns) & watch.epochs.tvb].tolist())
     period_s = base.clock.period_s or 0.0
     return len(had - has) * period_s
 
 
 def _accepted(base: Baseline, onset: Onset, found: Injected) -> Row:
     """Balises accepted since the onset, and of them those whose position was wrong there, or may have been."""
-    accepted = found.monitored.solution.accepted.filter(
-        pl.col("t") >= pl.lit(onset.t_ns).cast(pl.Datetime("ns", "UTC"))
-    )
-    t_ns = times_ns(accepted)
+    crossings = found.monitored.solution.crossings
+    accepted = np.flatnonzero(crossings.accepted & (crossings.t_ns >= onset.t_ns))
+    t_ns = crossings.t_ns[accepted]
     row = np.searchsorted(base.t_ns, t_ns).clip(max=base.t_ns.size - 1)
     train_m, sense = _train_at(base, t_ns, row)
-    at_m, astray = _moved_m(base, found, accepted, row)
+    index = base.monitored.match.path.track.index
+    elements = [index.get(crossings.netelement_id[number], -1) for number in accepted.tolist()]
+    at_m, astray = _moved_m(base, np.array(elements, dtype=np.int64), crossings.measure_m[accepted], row)
     at_m = at_m * sense + floats(base.epochs, "path_m")[row]
     own_low_m, own_high_m = (values[row] for values in base.own_m)
     moved_m = (at_m - train_m) * sense
@@ -175,12 +177,11 @@ def _accepted(base: Baseline, onset: Onset, found: Injected) -> Row:
     high_m = own_high_m + moved_m
     wrong = (low_m > limit_m) | (high_m < -limit_m) | astray
     right = (low_m >= -limit_m) & (high_m <= limit_m)
-    ids = accepted["balise_id"]
     return {
-        "accepted": accepted.height,
+        "accepted": accepted.size,
         "accepted_wrong": int(wrong.sum()),
         "accepted_unknown": int((~wrong & ~right).sum()),
-        "accepted_wrong_ids": ids.filter(pl.Series(wrong, dtype=pl.Boolean)).to_list(),
+        "accepted_wrong_ids": [crossings.balise_id[number] for number in accepted[wrong].tolist()],
     }
 
 

@@ -66,17 +66,13 @@ def _doppler_sigma(epochs: AlignedEpochs, span_s: Floats, change_mps: Floats, co
     return np.sqrt(variance)
 
 
-def channel_monitor(
-    epochs: pl.DataFrame, channel: pl.DataFrame | None, config: Configuration, absent: NotEvaluated = NO_OTHER_SOLUTION
-) -> Verdicts:
+def channel_monitor(epochs: pl.DataFrame, channel: pl.DataFrame, config: Configuration) -> Verdicts:
     """Path positions of two solutions at the same time against each other [m] (LOC Fig. 3).
 
     `epochs`: `t, path_m, sigma_along_m, fix_valid, on_track`; `channel`: the same of the other solution, on the same
     path; its last position since the epoch before counts (`paired`). Errors common to both make the
-    threshold larger than needed. `absent`: the reason where there is no other.
+    threshold larger than needed.
     """
-    if channel is None:
-        return no_verdicts(epochs.height, absent)
     usable = channel.filter("fix_valid", "on_track")
     own_m = pl.when(pl.col("fix_valid") & pl.col("on_track")).then("path_m")
     pairs = paired(epochs.select("t", path_m=own_m), usable, config.lds)
@@ -186,7 +182,11 @@ class MonitorInput:
 
 WITHOUT_MEMORY: Mapping[str, Callable[[MonitorInput], Verdicts]] = {
     "along_doppler": lambda seen: doppler_monitor(seen.epochs, seen.config),
-    "channel": lambda seen: channel_monitor(seen.epochs.table, seen.other, seen.config, seen.absent),
+    "channel": lambda seen: (
+        no_verdicts(seen.epochs.height, seen.absent)
+        if seen.other is None
+        else channel_monitor(seen.epochs.table, seen.other, seen.config)
+    ),
     "pseudorange": lambda seen: pseudorange_monitor(seen.epochs, seen.satellites, seen.config),
 }
 """Monitors by the name that `schemas.tables.ALL_MONITORS` gives them."""
