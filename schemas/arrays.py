@@ -9,6 +9,8 @@ import polars as pl
 Floats = npt.NDArray[np.float64]
 Ints = npt.NDArray[np.int64]
 Bools = npt.NDArray[np.bool_]
+Rows = Ints | Bools | slice
+"""Some of the rows of an array: by their numbers, by a mask, or from one to another."""
 
 NS_PER_S = 1_000_000_000
 

@@ -15,7 +15,7 @@ from importlib.resources import files
 from string import Formatter
 from typing import Any, TypeVar
 
-from schemas.enums import LostTo, MisfitCause, MisfitPlace, Note, NotShown, Reason, Remedy, RunVerdict
+from schemas.enums import Evidence, LostTo, MisfitCause, MisfitPlace, Note, NotShown, Reason, Remedy, RunVerdict
 from schemas.frozen import frozen
 
 Code = TypeVar("Code", bound=StrEnum)
@@ -80,6 +80,7 @@ MISFIT_PLACES = _sentences(MisfitPlace, "misfit_places")
 LOST = _sentences(LostTo, "lost")
 NOT_SHOWN = _sentences(NotShown, "not_shown")
 REMEDIES = _sentences(Remedy, "remedies")
+JUDGES: Mapping[str, str] = {kind.value: words for kind, words in _sentences(Evidence, "judges").items()}
 
 
 @frozen
@@ -166,13 +167,8 @@ def reason_words(run: Mapping[str, Any]) -> str:
         Reasons with their figures, separated by semicolons.
     """
     undecided = run["failures"] - run["failures_within_budget"] - run["failures_beyond_budget"]
-    figures = {
-        **{name: run[name] for name in ("unsafe_accepted", "unproven_accepted", "failures_beyond_budget")},
-        "failures_undecided": undecided,
-        **{name: f"{run[name] or 0.0:.3g}" for name in ("hazardous_natural_s", "unknown_in_use_s")},
-        "share_undiagnosed": f"{run['share_undiagnosed'] or 0.0:.1%}",
-    }
-    reasons = [REASONS[Reason(reason)].format(**figures) for reason in run["reasons"] or ()]
+    figures = {name: 0 if value is None else value for name, value in run.items()} | {"failures_undecided": undecided}
+    reasons = [REASONS[Reason(reason)].format_map(figures) for reason in run["reasons"] or ()]
     return "; ".join(reasons) or say("reasons", "none")
 
 

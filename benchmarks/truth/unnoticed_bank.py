@@ -16,9 +16,9 @@ import numpy as np
 import polars as pl
 from scipy.special import chdtri
 
+from datasets.experiment.bank import BankSpec, linear_bank
 from datasets.experiment.geometry import TAUS_S, Constellation, Geometry, default_geometry
-from datasets.experiment.linear_bank import BankSpec, linear_bank
-from datasets.experiment.rare import missed_detection_probability
+from datasets.experiment.sampling import missed_detection_probability
 from pipeline.show.terminal import show_table
 from pipeline.stages.monitors.axis import AxisSeries, ewma_weight, run_axis
 from pipeline.stages.monitors.pseudorange import clock_columns, line_of_sight_rows

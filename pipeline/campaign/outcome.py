@@ -108,7 +108,8 @@ def outcome_of(
 ) -> RunOutcome:
     """The outcome that a run's own tables show; below `low` availability it says what the moving time was lost to."""
     errors = runs["error"].drop_nulls().to_list()
-    judged = known_counts(runs).drop_nulls("missed_detections")
+    counted = runs.select("status", "evidence", *HAZARD_COUNTS, "missed_detections")
+    judged = known_counts(counted).drop_nulls("missed_detections")
     *counts, missed = judged.select(pl.sum(*HAZARD_COUNTS, "missed_detections")).row(0)
     verdict = worst_verdict(runs["verdict"].to_list())
     return RunOutcome(

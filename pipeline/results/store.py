@@ -26,7 +26,7 @@ from pipeline.storage.address import Address, is_url, join, redacted, shown
 from pipeline.storage.described import PREFIX, table_bytes
 from pipeline.storage.files import exists, read_bytes
 from schemas.config import Configuration, Settings, Vehicle, settings_from, to_toml, toml_of
-from schemas.conform import conform, dtypes
+from schemas.conform import dtypes
 from schemas.errors import ConfigError, UsageError
 from schemas.run import RunTables, Site
 from schemas.tables import CONTRACT_VERSION, TABLES
@@ -60,7 +60,7 @@ def write_run(tables: RunTables, out: Address, metadata: Mapping[str, str]) -> N
     for name in (*(name for name in TABLES if name != _MARKER), _MARKER):
         if name == _MARKER:
             noted["tables"] = json.dumps({table: sha256(content) for table, content in contents.items()})
-        contents[name] = table_bytes(conform(getattr(tables, name), TABLES[name]), name, TABLES[name], noted)
+        contents[name] = table_bytes(getattr(tables, name), name, TABLES[name], noted)
     write_files(out, tables.run_id, contents)
 
 

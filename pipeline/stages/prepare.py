@@ -17,6 +17,7 @@ from pipeline.stages.clean.clean import (
     require_two_times,
 )
 from pipeline.stages.evidence import TrainEvidence, evidence_of
+from pipeline.stages.evidence.anchors import read_anchors
 from pipeline.stages.evidence.gathering import on_time, without_frozen
 from pipeline.stages.follows import NOT_TESTED, Follows, follows_positions
 from pipeline.stages.matching import Match, match
@@ -82,8 +83,10 @@ class PreparedRun:
         moving = without_frozen(recorded, self.odometers, self.config.hazards)
         reference = reference_stretches(moving, pieces, network.track.index, self.config)
         reads = on_time(self.run.balise_reads, self.vehicle.reads_latency_s)
-        balises = self.site.balises
-        return evidence_of(reference, reads, balises, self.odometers, network, self.vehicle, self.config)
+        recorders = [
+            read_anchors(reads, self.site.balises, network.track, self.config.hazards),
+        ]
+        return evidence_of(reference, recorders, self.odometers, network, self.vehicle, self.config)
 
     def follows_of(self, solution: str) -> Follows:
         """Whether the odometer of the LDS is made of the positions of this solution."""

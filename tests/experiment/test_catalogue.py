@@ -8,11 +8,9 @@ import pytest
 
 from datasets.experiment import EXPERIMENTS
 from datasets.experiment import catalogue as module
-from datasets.experiment.catalogue import run_catalogue
+from datasets.experiment.catalogue import JOURNEYS, JourneyPlan, Stage, run_catalogue, stage, with_fault
 from datasets.experiment.catalogue_faults import CatalogueFault, catalogue
-from datasets.experiment.catalogue_tables import faults_table, monitors_table
-from datasets.experiment.catalogue_text import catalogue_page
-from datasets.experiment.catalogue_trial import JOURNEYS, JourneyPlan, Stage, stage, with_fault
+from datasets.experiment.catalogue_report import catalogue_page, faults_table, monitors_table
 from pipeline.stages.track.geodesy import distances_m
 from schemas.config import Configuration, MonitorConfig
 from schemas.run import RunLog, Site

@@ -5,8 +5,8 @@ from datetime import timedelta
 import polars as pl
 import pytest
 
+from datasets.experiment.catalogue import JOURNEYS, JourneyPlan, stage, with_fault
 from datasets.experiment.catalogue_faults import CatalogueFault
-from datasets.experiment.catalogue_trial import JOURNEYS, JourneyPlan, stage, with_fault
 from pipeline.one_run import replay
 from schemas.config import Configuration
 from schemas.run import RunLog

@@ -82,6 +82,7 @@ class PlannedFault(Settings):
 
     @property
     def amounts(self) -> Amounts:
+        """All that the plan asks of it, in `unit`."""
         amounts: Amounts = getattr(self, _AMOUNTS[self.kind][0])
         return amounts
 
@@ -98,7 +99,7 @@ class PlannedFault(Settings):
 
 
 class PlannedBank(Settings):
-    """A bank of the comparison: a configuration file, seen from the plan; `vehicle` in place of the command's."""
+    """A bank of the comparison: a configuration file, relative to the plan; `vehicle` in place of the command's."""
 
     name: Annotated[str, Field(pattern=r"^[A-Za-z0-9_.-]+$")]
     config: str
@@ -167,7 +168,14 @@ class Cell:
         return _direction(self.fault, self.target, self.amount)
 
     @property
+    def labels(self) -> dict[str, object]:
+        """What names the cell in every table."""
+        named = {"cell": self.name, "kind": self.fault.kind.value, "target": self.target, "direction": self.direction}
+        return named | {"amount": self.amount, "unit": self.fault.unit}
+
+    @property
     def hits_satellite(self) -> bool:
+        """It hits the range of one satellite, drawn for each injection."""
         return self.fault.target == SATELLITE
 
     @property
@@ -176,9 +184,11 @@ class Cell:
 
     @property
     def target(self) -> str:
+        """As in a fault file, or `satellite`."""
         return SATELLITE if self.hits_satellite else self.spec(1.0, None).target
 
     def spec(self, start_s: float, satellite: str | None) -> FaultSpec:
+        """The fault as a fault file would hold it, from `start_s` after the first epoch on."""
         return self.fault.spec(self.amount, start_s, satellite)
 
 

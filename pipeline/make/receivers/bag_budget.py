@@ -38,9 +38,6 @@ class _Nothing:
     def add(self, *_: Any) -> None:
         pass
 
-    def wanted(self, _: int) -> None:
-        """Nothing of any channel."""
-
 
 def unpacker_of(bag: Any, place: str, config: IngestConfig) -> Unpack:
     """What unpacks one message of an opened bag. Its chunks, of ROS 1, are bounded from here on."""

@@ -7,8 +7,8 @@ Touches files. It mends nothing: what does not fit is an error that lists every 
   `mcap_block` gathers messages, `mcap_summary` holds the log against what it says of itself).
 - Which stream does a topic feed? `plan`, by the recipes of schemas (`recipe`, `recipes`, `recipes_drivers`) or as the
   configuration maps it (`mapping`).
-- What do messages hold? Many at once where their layout is fixed (`layout`, `protobuf`, `ros_message`, `json_columns`),
-  else one by one (`generic`); `reader` puts both together.
+- What do messages hold? Many at once where their layout is fixed (`layout`, `protobuf`, `ros_message`, `json_columns`,
+  `json_typed`), else one by one; `reader` puts both together.
 - When? `stamps`, `timescale`. Which rows? `assemble`, `conform`, `correct`.
 - What does a log hold that nothing maps? `describe`, `guesses`, and for tables `csv_text`, `csv_draft`.
 """

@@ -105,7 +105,9 @@ def _refuse_world_frame(part: DecodedRows) -> None:
     source = part.source
     if not source.frame:
         return
-    for frame in part.frame[source.frame].drop_nulls().unique(maintain_order=True):
+    frames = part.frame[source.frame].drop_nulls()
+    # Mostly each is that of the message before.
+    for frame in frames.filter(frames.ne_missing(frames.shift())).unique(maintain_order=True):
         if is_world_frame(frame):
             (path,) = source.columns["speed_mps"].meta.root_names()
             raise world_frame(source.channel, path, frame)

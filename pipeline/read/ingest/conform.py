@@ -124,6 +124,9 @@ def _lossless(series: pl.Series, column: dy.Column, target: pl.DataType) -> pl.S
         if series.dtype.time_zone is None:
             return f"{series.dtype} without a time zone"
         series = series.dt.convert_time_zone("UTC")
+    if isinstance(column, dy.Enum) and len(series) > 1 and _is_constant(series):
+        one = _lossless(series.head(1), column, target)
+        return one if isinstance(one, str) else one.new_from_index(0, len(series))
     cast = series.cast(target, strict=False)
     if isinstance(column, dy.Enum):
         strange = series.cast(pl.String).filter(cast.is_null() & series.is_not_null()).unique().sort()
@@ -134,6 +137,11 @@ def _lossless(series: pl.Series, column: dy.Column, target: pl.DataType) -> pl.S
     else:
         whole = cast.null_count() == series.null_count() and (cast.cast(series.dtype, strict=False) == series).all()
     return cast if whole else f"{series.dtype}{_LOSSES.get(type(column), '')}"
+
+
+def _is_constant(series: pl.Series) -> bool:
+    """Whether every row holds the same value."""
+    return series.null_count() == 0 and bool((series == series[0]).all())
 
 
 def _strange_values(series: pl.Series, column: dy.Column, where: str) -> Iterator[InputError]:

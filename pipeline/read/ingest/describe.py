@@ -12,7 +12,7 @@ import polars as pl
 
 from pipeline.read.ingest.fields import fields_of
 from pipeline.read.ingest.guesses import COLUMNS, ORIGIN, WORDS, columns_in, first, mapping_lines, word_of
-from pipeline.read.ingest.mcap_block import Block, Messages, Stretches
+from pipeline.read.ingest.mcap_block import Block, Messages
 from pipeline.read.ingest.mcap_records import Channel
 from pipeline.read.ingest.mcap_run import LARGEST_MESSAGE, walk_log
 from pipeline.read.ingest.plan import Sample, sources_of
@@ -165,10 +165,6 @@ class Census:
 
     def __init__(self) -> None:
         self.met: dict[int, _ChannelCounts] = {}
-
-    def wanted(self, channel_id: int) -> Stretches | None:
-        """It counts, and looks into few."""
-        return {}
 
     def add(self, block: Block, channels: Mapping[int, Channel]) -> None:
         for channel_id, messages in block.items():

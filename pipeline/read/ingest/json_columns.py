@@ -1,13 +1,15 @@
-"""JSON messages to columns by pyarrow, whose parser holds every value against the type asked for.
+"""JSON messages to columns: at once where all hold the same fields, else by pyarrow.
 
-What pyarrow refuses or may misread (a text over several lines, 9.0 for a whole number) is parsed message by message.
+Both hold every value against the type asked for. What pyarrow refuses or may misread (a text over several lines, 9.0
+for a whole number) is parsed message by message.
 """
 
 from __future__ import annotations
 
 import json
 import re
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
+from contextlib import suppress
 from typing import Any, Literal
 
 import numpy as np
@@ -15,9 +17,11 @@ import polars as pl
 import pyarrow as pa
 import pyarrow.json
 
+from pipeline.read.ingest.json_typed import TypedMessages, typed_messages
 from pipeline.read.ingest.layout import Columns, Decoded, UndecodableError, Values, parse_path, undecodable
-from pipeline.read.ingest.mcap_block import Messages, Stretches
+from pipeline.read.ingest.mcap_block import Heads, Messages, joined_heads
 from pipeline.read.ingest.mcap_records import Channel
+from schemas.arrays import Ints
 
 _ARROW = {pl.Float64: pa.float64(), pl.Int64: pa.int64(), pl.Boolean: pa.bool_(), pl.String: pa.string()}
 # Literals that pyarrow takes and JSON does not know, and `null` after an object, which pyarrow does not survive.
@@ -27,13 +31,15 @@ _NULL_AFTER = re.compile(rb"\}\s*null")
 
 
 class JsonDecoder:
-    """Decodes the messages of a channel; `slow_messages`: those parsed one by one.
+    """Decodes the messages of a channel; `slow_messages`: those parsed one by one; `waiting`: bytes that wait for it.
 
     Raises `InputError` for a message that cannot be decoded.
     """
 
-    def __init__(self, channel: Channel, types: Mapping[str, pl.DataType]) -> None:
+    def __init__(self, channel: Channel, types: Mapping[str, pl.DataType], with_publish_time: bool = False) -> None:
         self.slow_messages = 0
+        self.waiting = 0
+        self._with_publish_time = with_publish_time
         self._channel = channel
         self._types = types
         tree: dict[str, Any] = {}
@@ -46,25 +52,52 @@ class JsonDecoder:
         self._schema = pa.schema(list(_struct(tree)))
         self._met: pa.Schema | None = None  # what of it the first messages held, while no other has held more
         self._narrow = True
+        self._typed: TypedMessages | None = None  # while all messages hold what the first did
+        self._is_first = True
+        self._content: list[memoryview] = []
+        self._lengths: list[Ints] = []
+        self._heads: list[Heads] = []
 
-    @property
-    def wanted(self) -> Stretches:
-        """The parser takes whole messages."""
-        return {}
+    def add(self, messages: Messages) -> None:
+        """Take the texts of all messages."""
+        text = _with_byte_before(messages)
+        self._content.append(text)
+        self._lengths.append(messages.length)
+        self._heads.append(messages.heads(self._with_publish_time))
+        self.waiting += len(text)
 
-    def decode(self, messages: Messages) -> Iterator[Decoded]:
-        """The fields of all messages."""
-        content = _join_payloads(messages)
+    def decoded(self) -> Iterator[Decoded]:
+        """The fields of all messages that wait."""
+        if not self.waiting:
+            return
+        texts = _Texts(bytearray().join(self._content), np.concatenate(self._lengths))
+        heads = joined_heads(self._heads)
+        self.waiting = 0
+        self._content.clear()
+        self._lengths.clear()
+        self._heads.clear()
+        columns = self._at_once(texts) if texts.are_between_braces() else None
+        if columns is None:
+            self.slow_messages += len(texts)
+            columns = one_by_one(self._channel, texts, heads.log_time, self._types)
+        yield heads, columns
+
+    def _at_once(self, texts: _Texts) -> Columns | None:
+        """The fields of messages each between braces: as many objects as messages are then one each."""
+        if self._is_first:
+            self._is_first = False
+            with suppress(UndecodableError):
+                self._typed = typed_messages(self._types, parse_json(next(iter(texts))))
+        if self._typed is not None:
+            columns = self._typed.columns(texts.content, len(texts))
+            if columns is not None:
+                return columns
+            self._typed = None
         try:
-            table = None if content is None else self._parsed(content)
+            table = self._parsed(texts.content) if texts.are_plain() else None
         except pa.ArrowInvalid:
-            table = None
-        # Every payload starts and ends as an object does: so many objects as messages are one each.
-        if table is not None and table.num_rows == len(messages):
-            yield messages, self._columns(table)
-        else:
-            self.slow_messages += len(messages)
-            yield messages, one_by_one(self._channel, messages, self._types)
+            return None
+        return self._columns(table) if table is not None and table.num_rows == len(texts) else None
 
     def _columns(self, table: pa.Table) -> Columns:
         frame = pl.DataFrame(pl.from_arrow(table))
@@ -90,17 +123,19 @@ class JsonDecoder:
         return table
 
 
-def one_by_one(channel: Channel, messages: Messages, types: Mapping[str, pl.DataType]) -> Columns:
+def one_by_one(
+    channel: Channel, payloads: Iterable[bytes], log_times: Iterable[int], types: Mapping[str, pl.DataType]
+) -> Columns:
     """The fields by Python's own parser. Raises `InputError` for the first message that cannot be decoded."""
     steps = {path: parse_path(path) for path in types}
     values: dict[str, list[Any]] = {path: [] for path in types}
-    for row in range(len(messages)):
+    for payload, log_time in zip(payloads, log_times, strict=True):
         try:
-            document = parse_json(messages.payload(row))
+            document = parse_json(payload)
             for path, dtype in types.items():
                 values[path].append(_fitting(_at(document, steps[path]), dtype))
         except UndecodableError as error:
-            raise undecodable(channel, messages.log_time[row], error) from None
+            raise undecodable(channel, log_time, error) from None
     return {path: pl.Series(path, column, dtype=types[path]) for path, column in values.items()}
 
 
@@ -130,16 +165,39 @@ def _value(path: str) -> pl.Expr:
     return value
 
 
-def _join_payloads(messages: Messages) -> bytearray | None:
-    """The payloads, one after the other; none if any is not the UTF-8 text of something between braces."""
-    content = bytearray(_with_byte_before(messages))
-    ends = np.cumsum(messages.length + 1)
-    np.frombuffer(content, dtype=np.uint8)[ends - messages.length - 1] = ord("\n")
-    # A letter is found ten times as fast as a word.
-    strange = any(word[:1] in content and word in content for word in _LITERALS) and _AS_VALUE.search(content)
-    if strange or (b"null" in content and _NULL_AFTER.search(content)) or not _is_utf8(content):
-        return None
-    return content if _all_between_braces(messages) else None
+class _Texts:
+    """The texts of messages, one after the other, on a line each; `content` has a byte before each for that."""
+
+    def __init__(self, content: bytearray, lengths: Ints) -> None:
+        self.content = content
+        self.lengths = lengths
+        self._ends = np.cumsum(lengths + 1)
+        self._bytes = np.frombuffer(content, dtype=np.uint8)
+        self._bytes[self._ends - lengths - 1] = ord("\n")
+
+    def __len__(self) -> int:
+        return len(self.lengths)
+
+    def __iter__(self) -> Iterator[bytes]:
+        for end, length in zip(self._ends.tolist(), self.lengths.tolist(), strict=True):
+            yield bytes(self.content[end - length : end])
+
+    def are_plain(self) -> bool:
+        """Whether all is UTF-8, and nothing in it that pyarrow would misread."""
+        content = self.content
+        # A letter is found ten times as fast as a word.
+        strange = any(word[:1] in content and word in content for word in _LITERALS) and _AS_VALUE.search(content)
+        return not (strange or (b"null" in content and _NULL_AFTER.search(content))) and _is_utf8(content)
+
+    def are_between_braces(self) -> bool:
+        """Whether each is something between braces, but for white space around it."""
+        if not self.lengths.all():
+            return False
+        starts = self._ends - self.lengths
+        others = (self._bytes[starts] != ord("{")) | (self._bytes[self._ends - 1] != ord("}"))
+        cuts = zip(starts[others].tolist(), self._ends[others].tolist(), strict=True)
+        texts = (self.content[start:end].strip(b" \t\r\n") for start, end in cuts)
+        return all(text[:1] == b"{" and text[-1:] == b"}" for text in texts)
 
 
 def _with_byte_before(messages: Messages) -> memoryview:
@@ -151,17 +209,6 @@ def _with_byte_before(messages: Messages) -> memoryview:
     every_other = pl.int_range(0, len(bounds), 2, eager=True)
     taken = parts.take(every_other.to_arrow())
     return memoryview(taken.buffers()[2])[: int(messages.length.sum()) + len(messages)]
-
-
-def _all_between_braces(messages: Messages) -> bool:
-    """Whether the text of every message is something between braces, but for white space around it."""
-    if not messages.length.all():
-        return False
-    first = messages.data[messages.start]
-    last = messages.data[messages.start + messages.length - 1]
-    others = np.flatnonzero((first != ord("{")) | (last != ord("}")))
-    texts = (messages.payload(row).strip(b" \t\r\n") for row in others.tolist())
-    return all(text[:1] == b"{" and text[-1:] == b"}" for text in texts)
 
 
 def _is_utf8(content: bytearray) -> bool:

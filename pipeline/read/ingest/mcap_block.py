@@ -5,9 +5,9 @@ from __future__ import annotations
 from array import array
 from collections import defaultdict
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass
 from functools import cached_property
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -31,45 +31,38 @@ MESSAGE_HEAD = np.dtype(
 )
 _FIXED_FIELDS = MESSAGE_HEAD.itemsize - HEAD_SIZE
 
-Stretch = tuple[int, int]
-"""From one byte of a payload to another."""
-Stretches = Mapping[int, Sequence[Stretch]]
-"""Of messages by their length."""
-Wanted = Callable[[int], Stretches | None]
-"""Of a channel: what will be read of its messages, none of a length that is not named; None where nobody reads them."""
-
 
 @frozen
 class Records:
-    """Records of neighbouring chunks; side by side only where somebody asks for more than was read ahead.
+    """Records of neighbouring chunks; side by side only where somebody asks for them."""
 
-    Of a chunk that was read ahead its records are not kept, but unpacked once more.
-    """
-
-    parts: Sequence[Bytes | Callable[[], Bytes]]
+    parts: Sequence[Bytes]
 
     @cached_property
     def whole(self) -> Bytes:
-        parts = [part() if callable(part) else part for part in self.parts]
-        return parts[0] if len(parts) == 1 else np.concatenate(parts)
+        return self.parts[0] if len(self.parts) == 1 else np.concatenate(self.parts)
 
 
-@frozen
-class ReadAhead:
-    """Stretches of payloads of one length, read while their chunk was in the cache: one row per message.
-
-    `rows`: of the messages that ask, None for all.
+class Heads(NamedTuple):
+    """Of messages: their places in the order of the file, and times [ns]; those of publishing where they were asked
+    for.
     """
 
-    of: Mapping[Stretch, Bytes] = field(default_factory=dict)
-    rows: Ints | None = None
+    ordinal: Ints
+    log_time: Ints
+    publish_time: Ints | None
 
-    def get(self, stretch: Stretch) -> Bytes | None:
-        found = self.of.get(stretch)
-        return found if found is None or self.rows is None else found[self.rows]
+    def chosen(self, rows: Ints | slice) -> Heads:
+        """Some of them."""
+        publish_time = None if self.publish_time is None else self.publish_time[rows]
+        return Heads(self.ordinal[rows], self.log_time[rows], publish_time)
 
-    def chosen(self, rows: Ints) -> ReadAhead:
-        return ReadAhead(self.of, rows if self.rows is None else self.rows[rows])
+
+def joined_heads(parts: Sequence[Heads]) -> Heads:
+    """Those of one block after the other."""
+    ordinals, log_times, publish_times = zip(*parts, strict=True)
+    publish_time = None if publish_times[0] is None else np.concatenate(publish_times)
+    return Heads(np.concatenate(ordinals), np.concatenate(log_times), publish_time)
 
 
 @frozen
@@ -84,7 +77,6 @@ class Messages:
     length: Ints
     log_time: Ints
     before: int = 0
-    ahead: ReadAhead = ReadAhead()
 
     def __len__(self) -> int:
         return len(self.start)
@@ -93,20 +85,19 @@ class Messages:
     def data(self) -> Bytes:
         return self.records.whole
 
-    @property
-    def ordinal(self) -> Ints:
-        """What orders messages of all channels of the log as they stand in the file."""
-        return self.start + self.before
+    @cached_property
+    def longest(self) -> int:
+        """Of the payloads [bytes]."""
+        return int(self.length.max())
 
-    @property
-    def publish_time(self) -> Ints:
-        """The last field of the heads that stand before the payloads."""
-        return self.stretches(-8, 0).view("<i8")[:, 0]
+    def heads(self, with_publish_time: bool = False) -> Heads:
+        """The time of publishing is the last field before a payload."""
+        publish_time = self.stretches(-8, 0).view("<i8")[:, 0] if with_publish_time else None
+        return Heads(self.start + self.before, self.log_time, publish_time)
 
     def stretches(self, start: int, end: int) -> Bytes:
         """From one byte to another of each payload, one row each; the payloads must be that long."""
-        ahead = self.ahead.get((start, end))
-        return stretches_of(self.data, self.start + start, end - start) if ahead is None else ahead
+        return stretches_of(self.data, self.start + start, end - start)
 
     def payload(self, row: int) -> bytes:
         return self.data[self.start[row] :][: self.length[row]].tobytes()
@@ -114,8 +105,7 @@ class Messages:
     def chosen(self, rows: Ints | Bools | slice) -> Messages:
         """Some of them."""
         these = np.arange(len(self))[rows]
-        start, length, log_time = self.start[these], self.length[these], self.log_time[these]
-        return Messages(self.records, start, length, log_time, self.before, self.ahead.chosen(these))
+        return Messages(self.records, self.start[these], self.length[these], self.log_time[these], self.before)
 
 
 Block = dict[int, Messages]  # by channel
@@ -130,59 +120,25 @@ def stretches_of(data: Bytes, starts: Ints, width: int) -> Bytes:
     return every_offset[starts].view(np.uint8).reshape(-1, width)
 
 
-@frozen
-class Part:
-    """Messages of one channel among records side by side, in order: where they begin, and how long payloads are.
-
-    `ahead`: what was read of all of them; None where that is nothing.
-    """
+class Part(NamedTuple):
+    """Messages of one channel among records side by side, in order: where they begin, and how long payloads are."""
 
     starts: Ints
     lengths: Ints
     log_times: Ints
-    ahead: Mapping[Stretch, Bytes] | None = None
-
-    def reading_ahead(self, data: Bytes, wanted: Stretches) -> Part:
-        """Where all have the one length of which something is wanted; to gather several costs more than it saves."""
-        if len(wanted) != 1 or (self.lengths != next(iter(wanted))).any():
-            return self
-        starts = self.starts + MESSAGE_HEAD.itemsize
-        (stretches,) = wanted.values()
-        ahead = {(begin, end): stretches_of(data, starts + begin, end - begin) for begin, end in stretches}
-        return replace(self, ahead=ahead)
 
 
-@frozen
-class Piece:
-    """Records side by side, as of one chunk, and the messages among them, by channel.
+class Piece(NamedTuple):
+    """Records side by side, as of one chunk, and the messages among them, by channel; `offset`: in the file."""
 
-    `offset`: its place in the file; `size`: of the records [bytes].
-    """
-
-    data: Bytes | Callable[[], Bytes]
+    data: Bytes
     parts: Mapping[int, Part]
     offset: int
-    size: int
-
-    def reading_ahead(self, wanted: Wanted, again: Callable[[], Bytes]) -> Piece:
-        """With what is wanted of its messages, and without its records where that is all: `again` unpacks them."""
-        assert not callable(self.data)
-        parts = dict(self.parts)
-        is_all = True
-        for channel, part in self.parts.items():
-            stretches = wanted(channel)
-            if stretches is not None:
-                parts[channel] = part.reading_ahead(self.data, stretches)
-                is_all &= parts[channel].ahead is not None
-        return Piece(again if is_all else self.data, parts, self.offset, self.size)
 
     @property
-    def held(self) -> int:
-        """Bytes that it takes."""
-        if not callable(self.data):
-            return self.size
-        ahead = sum(rows.nbytes for part in self.parts.values() for rows in (part.ahead or {}).values())
-        return ahead + sum(24 * len(part.starts) for part in self.parts.values())
+    def size(self) -> int:
+        """Of the records [bytes]."""
+        return len(self.data)
 
 
 @dataclass
@@ -205,7 +161,7 @@ def piece_of_chunk(
     offset: int,
     on_record: OnRecord,
     allowance: Allowance,
-    indexes: Sequence[tuple[int, bytes]] = (),
+    indexes: Sequence[tuple[int, memoryview]] = (),
     on_odd_index: Callable[[DamageError], None] = _refuse,
 ) -> Piece:
     """The messages of a chunk, which its records must fill exactly; other records go to `on_record`.
@@ -230,7 +186,7 @@ def piece_of_chunk(
     return piece
 
 
-def _agree(piece: Piece, indexes: Sequence[tuple[int, bytes]]) -> bool:
+def _agree(piece: Piece, indexes: Sequence[tuple[int, memoryview]]) -> bool:
     """An index names all messages of its channel, each once: a reader that trusts it would lose some else."""
     for channel, entries in indexes:
         part = piece.parts.get(channel)
@@ -241,7 +197,7 @@ def _agree(piece: Piece, indexes: Sequence[tuple[int, bytes]]) -> bool:
     return True
 
 
-def _listed(data: Bytes, offset: int, indexes: Sequence[tuple[int, bytes]]) -> tuple[int, Piece] | None:
+def _listed(data: Bytes, offset: int, indexes: Sequence[tuple[int, memoryview]]) -> tuple[int, Piece] | None:
     """Where the first message begins, and all by their indexes; none unless they follow each other from there to the
     end and are as the indexes list them.
     """
@@ -250,37 +206,38 @@ def _listed(data: Bytes, offset: int, indexes: Sequence[tuple[int, bytes]]) -> t
         return None
     log_times, starts = np.concatenate(list(tables.values())).T
     order = np.argsort(starts, kind="stable")
-    first, last = int(starts[order[0]]), int(starts[order[-1]])
+    in_order = starts[order]
+    first, last = int(in_order[0]), int(in_order[-1])
     if first < 0 or last > len(data) - MESSAGE_HEAD.itemsize:
         return None
     heads = stretches_of(data, starts, MESSAGE_HEAD.itemsize).reshape(-1).view(MESSAGE_HEAD)
     lengths = heads["length"].astype(np.int64)
-    ends = (starts + lengths)[order] + HEAD_SIZE
-    counts = [len(table) for table in tables.values()]
+    ends = in_order + lengths[order] + HEAD_SIZE
     if (
         ends[-1] != len(data)
-        or (ends[:-1] != starts[order][1:]).any()
+        or not np.array_equal(ends[:-1], in_order[1:])
         or lengths.min() < _FIXED_FIELDS
         or (heads["opcode"] != int(Opcode.MESSAGE)).any()
-        or (heads["log_time"] != log_times).any()
-        or (heads["channel"] != np.repeat(list(tables), counts)).any()
+        or not np.array_equal(heads["log_time"], log_times)
     ):
         return None
     lengths -= _FIXED_FIELDS
     parts: dict[int, Part] = {}
     at = 0
-    for channel, count in zip(tables, counts, strict=True):
-        rows = slice(at, at + count)
+    for channel, table in tables.items():
+        rows = slice(at, at + len(table))
+        if (heads["channel"][rows] != channel).any():
+            return None
         parts[channel] = Part(starts[rows], lengths[rows], log_times[rows])
-        at += count
-    return first, Piece(data, parts, offset, len(data))
+        at += len(table)
+    return first, Piece(data, parts, offset)
 
 
-def _by_channel(indexes: Sequence[tuple[int, bytes]]) -> dict[int, Ints]:
+def _by_channel(indexes: Sequence[tuple[int, memoryview]]) -> dict[int, Ints]:
     """Log time and start of the messages of each channel, in the order of their starts."""
-    entries: dict[int, bytes] = {}
+    entries: dict[int, memoryview] = {}
     for channel, more in indexes:
-        entries[channel] = entries.get(channel, b"") + more
+        entries[channel] = memoryview(bytes(entries[channel]) + more) if channel in entries else more
     tables = {channel: np.frombuffer(of_channel, dtype="<i8").reshape(-1, 2) for channel, of_channel in entries.items()}
     for channel, table in tables.items():
         if (table[1:, 1] < table[:-1, 1]).any():
@@ -329,7 +286,7 @@ def _walked(content: Any, starts: array[int], offset: int) -> Piece:
     if len(at) and (stretches_of(data, at + 1, 8).view("<i8") < _FIXED_FIELDS).any():
         raise DamageError(offset, "a message is shorter than its header")
     if not len(at):
-        return Piece(data, {}, offset, len(data))
+        return Piece(data, {}, offset)
     heads = stretches_of(data, at, MESSAGE_HEAD.itemsize).reshape(-1).view(MESSAGE_HEAD)
     order = np.argsort(heads["channel"], kind="stable")
     channels = heads["channel"][order]
@@ -338,7 +295,7 @@ def _walked(content: Any, starts: array[int], offset: int) -> Piece:
         int(heads["channel"][rows[0]]): Part(at[rows], lengths[rows], log_times[rows])
         for rows in np.split(order, np.flatnonzero(channels[1:] != channels[:-1]) + 1)
     }
-    return Piece(data, parts, offset, len(data))
+    return Piece(data, parts, offset)
 
 
 def block_of(pieces: list[Piece], before: int) -> Block:
@@ -355,13 +312,10 @@ def block_of(pieces: list[Piece], before: int) -> Block:
 
 def _messages(parts: Sequence[tuple[int, Part]], records: Records, before: int) -> Messages:
     """`parts`: where payloads behind their heads lie in the records, beside their place in the piece."""
+    if len(parts) == 1:
+        ((base, part),) = parts
+        return Messages(records, part.starts + base, part.lengths, part.log_times, before)
     starts = np.concatenate([part.starts + base for base, part in parts])
     lengths = np.concatenate([part.lengths for _, part in parts])
     log_times = np.concatenate([part.log_times for _, part in parts])
-    read = [part.ahead for _, part in parts if part.ahead is not None]
-    # Where not all of these pieces were read alike, a stretch is read when it is asked for.
-    alike = len(read) == len(parts) and all(of_part.keys() == read[0].keys() for of_part in read)
-    if not alike or (lengths != lengths[0]).any():
-        return Messages(records, starts, lengths, log_times, before)
-    ahead = {stretch: np.concatenate([of_part[stretch] for of_part in read]) for stretch in read[0]}
-    return Messages(records, starts, lengths, log_times, before, ReadAhead(ahead))
+    return Messages(records, starts, lengths, log_times, before)

@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import struct
-from io import BytesIO
 from struct import Struct
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import pyarrow as pa
 from isal.isal_zlib import crc32
@@ -62,21 +61,27 @@ class Channel:
 Record = TypeVar("Record", bound=McapRecord)
 _INDEX_HEAD = Struct("<HI")
 _INDEX_ENTRY_SIZE = 16
+_LARGE = 16 * 1024  # bytes
 
 
 class _Stream(ReadDataStream):
-    """As of the `mcap` package, but a field that its record cuts short is an error."""
+    """As of the `mcap` package, but a field that its record cuts short is an error, and what a chunk holds no copy."""
 
-    def read(self, length: int) -> bytes:
-        content = super().read(length)
+    def __init__(self, record: bytes) -> None:
+        self._record = memoryview(record)
+        self._count = 0
+
+    def read(self, length: int) -> Any:
+        content = self._record[self._count :][:length]
         if len(content) < length:
             raise EndOfFile
-        return content
+        self._count += length
+        return content if length > _LARGE else bytes(content)
 
 
 def parse(kind: type[Record], body: bytes, offset: int) -> Record:
     """A record by the reader of the `mcap` package; it must be used up exactly."""
-    stream = _Stream(BytesIO(body))
+    stream = _Stream(body)
     name = kind.__name__
     try:
         record: Record = kind.read(stream)  # type: ignore[attr-defined]
@@ -89,9 +94,9 @@ def parse(kind: type[Record], body: bytes, offset: int) -> Record:
     return record
 
 
-def parse_message_index(body: bytes, offset: int) -> tuple[int, bytes]:
+def parse_message_index(body: bytes, offset: int) -> tuple[int, memoryview]:
     """Channel and the array of (log time, offset in the chunk), 16 bytes each."""
-    entries = body[_INDEX_HEAD.size :]
+    entries = memoryview(body)[_INDEX_HEAD.size :]
     if len(body) < _INDEX_HEAD.size or _INDEX_HEAD.unpack_from(body)[1] != len(entries):
         raise DamageError(offset, "the array of a MessageIndex record does not fill it")
     if len(entries) % _INDEX_ENTRY_SIZE:

@@ -7,6 +7,7 @@ import io
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
+from itertools import chain
 from typing import Protocol
 
 import numpy as np
@@ -16,7 +17,7 @@ from pipeline.read.ingest.assemble import DecodedRows, stream_frames
 from pipeline.read.ingest.conform import refuse
 from pipeline.read.ingest.correct import read_corrections, read_damage, read_raw_logs
 from pipeline.read.ingest.fields import fields_of
-from pipeline.read.ingest.mcap_block import Block, Messages, Stretches
+from pipeline.read.ingest.mcap_block import Block, Messages
 from pipeline.read.ingest.mcap_records import Channel, DamageError
 from pipeline.read.ingest.mcap_walk import McapWalk
 from pipeline.read.ingest.plan import Sample, Source, is_candidate, settle, solution_of, sources_of
@@ -55,12 +56,10 @@ class McapStreams:
                 for part in _pieces(messages):
                     reader.add(part)
 
-    def wanted(self, channel_id: int) -> Stretches | None:
-        """None for a channel that feeds no stream; several readers of one read for themselves."""
-        readers = self.readers.get(channel_id)
-        if readers is None or len(readers) > 1:
-            return {}
-        return readers[0].wanted if readers else None
+    def decode(self) -> None:
+        """What waits to be decoded."""
+        for reader in chain.from_iterable(self.readers.values()):
+            reader.decode()
 
     def _readers(self, messages: Messages, channel: Channel) -> list[SourceReader]:
         if not is_candidate(channel, self._config):
@@ -79,10 +78,9 @@ class McapStreams:
 
 
 def _check_sizes(messages: Messages, channel: Channel) -> None:
-    largest = int(messages.length.max())
-    if largest > LARGEST_MESSAGE:
+    if messages.longest > LARGEST_MESSAGE:
         raise InputError(
-            f"has a message of {largest} bytes",
+            f"has a message of {messages.longest} bytes",
             place=channel.place,
             expected=f"at most {LARGEST_MESSAGE} bytes in a topic that feeds a stream",
         )
@@ -90,7 +88,7 @@ def _check_sizes(messages: Messages, channel: Channel) -> None:
 
 def _pieces(messages: Messages) -> Iterator[Messages]:
     """The messages of an unusually large block in parts: decoding needs several times their size."""
-    if messages.length.sum() < _DECODED_TOGETHER:
+    if messages.longest * len(messages) < _DECODED_TOGETHER:
         yield messages
         return
     cuts = np.flatnonzero(np.diff(messages.length.cumsum() // _DECODED_TOGETHER)) + 1
@@ -129,7 +127,10 @@ def read_mcaps(
         streams = McapStreams(config)
         ordinal = logs[-1].walk.next_ordinal if logs else 0
         sink = _Sinks([streams, *beside[number : number + 1]])
-        walk, digest = walk_log(path, config, sink, with_digest, ordinal)
+        try:
+            walk, digest = walk_log(path, config, sink, with_digest, ordinal)
+        finally:
+            streams.decode()  # of two errors that of the message that comes first, not of the damage behind it
         logs.append(_WalkedLog(path, walk, streams, digest))
     frames, held, slow_messages, left_over, damage = _frames(logs, config, partly)
     messages: Counter[str] = Counter()
@@ -177,11 +178,9 @@ def _partial_until_ns(logs: Sequence[_WalkedLog], gnss: pl.DataFrame) -> int | N
 
 
 class BlockSink(Protocol):
-    """Looks at the messages of a log; what it wants of each in the blocks to come is only a hint."""
+    """Looks at the messages of a log."""
 
     def add(self, block: Block, channels: Mapping[int, Channel]) -> None: ...
-
-    def wanted(self, channel_id: int) -> Stretches | None: ...
 
 
 class _Sinks:
@@ -193,9 +192,6 @@ class _Sinks:
     def add(self, block: Block, channels: Mapping[int, Channel]) -> None:
         for sink in self._sinks:
             sink.add(block, channels)
-
-    def wanted(self, channel_id: int) -> Stretches | None:
-        return self._sinks[0].wanted(channel_id) if len(self._sinks) == 1 else {}
 
 
 def walk_log(
@@ -210,7 +206,7 @@ def walk_log(
             size = stream.seek(0, io.SEEK_END)
             chunk_limit = int(config.chunk_limit_mib * _MIB)
             unpacked = most_unpacked(size, config)
-            walk = McapWalk(stream, size, str(path), chunk_limit, unpacked, first_ordinal, streams.wanted)
+            walk = McapWalk(stream, size, str(path), chunk_limit, unpacked, first_ordinal)
             for block in walk.blocks():
                 streams.add(block, walk.channels)
             stream.seek(0)

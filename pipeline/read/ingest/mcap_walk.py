@@ -10,10 +10,8 @@ from __future__ import annotations
 from array import array
 from collections import Counter
 from collections.abc import Iterator
-from functools import partial
 from typing import IO
 
-import numpy as np
 from isal.isal_zlib import crc32
 from mcap import records
 from mcap.opcode import Opcode
@@ -21,9 +19,7 @@ from mcap.opcode import Opcode
 from pipeline.read.ingest.mcap_block import (
     Allowance,
     Block,
-    Bytes,
     Piece,
-    Wanted,
     block_of,
     piece_of_chunk,
     piece_of_messages,
@@ -48,9 +44,8 @@ _AFTER_THE_DATA = (
 )  # fmt: skip
 _ONLY_THERE = _AFTER_THE_DATA[2:]
 _KNOWN = int(max(Opcode))  # unknown records, of higher ones, are skipped, by specification
-_TOGETHER = 4 * 1024 * 1024  # chunks of up to so many bytes are taken at once
+_TOGETHER = 256 * 1024  # smaller chunks are taken together; more would not stay in the processor's cache
 _LEAST_PIECE = 8 * 1024  # what a piece that waits takes itself
-_MOST_AGAIN = 16  # times as many bytes as are taken at once may have to be unpacked again at once
 _LOOSE = 64 * 1024  # of a log without chunks read at once
 _FREE_RECORDS = 1 << 18  # records that the chunks of a log may hold beyond one per byte
 _SLACK = 1024 * 1024  # what does not compress grows a little
@@ -67,7 +62,6 @@ class McapWalk:
         chunk_limit: int,
         most_unpacked: int,
         first_ordinal: int = 0,
-        wanted: Wanted = lambda _: {},
     ) -> None:
         self.channels: dict[int, Channel] = {}
         self.met = WalkCounts()
@@ -75,7 +69,6 @@ class McapWalk:
         self.without_crc = 0  # blocks of messages whose content no checksum covers
         self._bare_chunks = array("q")  # contents of chunks without checksum, from and to
         self._stream = stream
-        self._wanted = wanted
         self._size = size
         self._file = file
         self._limit = chunk_limit
@@ -254,17 +247,12 @@ class McapWalk:
         content = unpacked(chunk, position)
         indexes, end = self._indexes(end, position, size)
         self.met.chunks.add(chunk, position, record, record)
-        piece = piece_of_chunk(content, position, self._chunk_record, self._allowance, indexes, self.met.add_orphan)
-        self._keep(piece.reading_ahead(self._wanted, partial(self._unpacked_again, position, len(body))))
+        self._keep(piece_of_chunk(content, position, self._chunk_record, self._allowance, indexes, self.met.add_orphan))
         return end
 
-    def _unpacked_again(self, position: int, length: int) -> Bytes:
-        chunk = parse(records.Chunk, self._read(position + HEAD_SIZE, length), position)
-        return np.frombuffer(unpacked(chunk, position), dtype=np.uint8)
-
-    def _indexes(self, position: int, chunk: int, room: int) -> tuple[list[tuple[int, bytes]], int]:
+    def _indexes(self, position: int, chunk: int, room: int) -> tuple[list[tuple[int, memoryview]], int]:
         """Channel and entries of the message indexes of a chunk, and the position behind them or a cut in them."""
-        indexes: list[tuple[int, bytes]] = []
+        indexes: list[tuple[int, memoryview]] = []
         while position + HEAD_SIZE <= self._size:
             opcode, length = HEAD.unpack(self._read(position, HEAD_SIZE))
             if opcode != Opcode.MESSAGE_INDEX or position + HEAD_SIZE + length > self._size:
@@ -295,7 +283,7 @@ class McapWalk:
 
     def _keep(self, piece: Piece) -> None:
         self._pieces.append(piece)
-        self._waiting += max(piece.held, piece.size // _MOST_AGAIN, _LEAST_PIECE)
+        self._waiting += max(piece.size, _LEAST_PIECE)
 
     def _block(self) -> Block:
         """The messages that wait."""
@@ -307,9 +295,10 @@ class McapWalk:
             if channel_id not in self.channels:
                 self._define_lost(channel_id, pieces[0].offset)
             self.met.message_counts[channel_id] += len(messages)
-            if messages.log_time.min() < 0:
+            first, last = int(messages.log_time.min()), int(messages.log_time.max())
+            if first < 0:
                 raise DamageError(pieces[0].offset, "a log time behind it is beyond the year 2262")
-            self.met.add_times(int(messages.log_time.min()), int(messages.log_time.max()))
+            self.met.add_times(first, last)
         self._ordinal += sum(piece.size for piece in pieces)
         return block
 

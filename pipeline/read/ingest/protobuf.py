@@ -178,7 +178,7 @@ def _field(kind: int, wire: int, start: int, end: int) -> Field:
     if kind == _BOOL and wire == _VARINT and end - start == 1:
         return flag(start)
     if wire == _VARINT and (kind in _VARINTS or kind in _ZIGZAG):
-        return Field(pl.Int64, start, end, lambda rows: _numbers(rows, kind))
+        return Field(pl.Int64, start, end, lambda blocks: _numbers(np.concatenate(blocks), kind))
     raise UndecodableError("a field is written as another type than its schema says")
 
 

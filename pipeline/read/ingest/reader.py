@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from functools import partial
 
 import numpy as np
@@ -9,8 +10,8 @@ import polars as pl
 
 from pipeline.read.ingest.fields import definition_of
 from pipeline.read.ingest.json_columns import JsonDecoder
-from pipeline.read.ingest.layout import LayoutDecoder, Values
-from pipeline.read.ingest.mcap_block import Messages, Stretches
+from pipeline.read.ingest.layout import Layout, LayoutDecoder, Values
+from pipeline.read.ingest.mcap_block import Messages
 from pipeline.read.ingest.plan import Source
 from pipeline.read.ingest.protobuf import layout_by
 from pipeline.read.ingest.ros_message import layout_of_cdr
@@ -20,14 +21,20 @@ from schemas.arrays import Ints
 ORDINAL = "(ordinal)"  # place of a message in the file
 
 
-def _decoder_of(source: Source) -> JsonDecoder | LayoutDecoder:
+_TOGETHER = 4 * 1024 * 1024  # bytes that are decoded at once
+
+
+def _decoder_of(source: Source, with_publish_time: bool) -> JsonDecoder | LayoutDecoder:
     channel = source.channel
     if channel.encoding == "json":
-        return JsonDecoder(channel, source.types)
+        return JsonDecoder(channel, source.types, with_publish_time)
     definition = definition_of(channel)
+    walk: Callable[[bytes], Layout]
     if channel.encoding == "cdr":
-        return LayoutDecoder(channel, partial(layout_of_cdr, definition, source.types, source.recipe.rows))
-    return LayoutDecoder(channel, layout_by(definition.DESCRIPTOR, source.types))
+        walk = partial(layout_of_cdr, definition, source.types, source.recipe.rows)
+    else:
+        walk = layout_by(definition.DESCRIPTOR, source.types)
+    return LayoutDecoder(channel, walk, with_publish_time)
 
 
 class SourceReader:
@@ -35,8 +42,8 @@ class SourceReader:
 
     def __init__(self, source: Source) -> None:
         self.source = source
-        self._decoder = _decoder_of(source)
         used = {name for time in source.times.values() for name in time.fields}
+        self._decoder = _decoder_of(source, PUBLISH_TIME in used)
         self._times = [name for name in (LOG_TIME, PUBLISH_TIME) if name in used]
         self._types = {name: pl.Int64() for name in (ORDINAL, *self._times)} | dict(source.types)
         self._parts: dict[str, list[Values]] = {name: [] for name in self._types}
@@ -46,24 +53,25 @@ class SourceReader:
         """How many messages were decoded one by one."""
         return self._decoder.slow_messages
 
-    @property
-    def wanted(self) -> Stretches:
-        """What is read of each message, by its length, as far as it is known by now."""
-        return self._decoder.wanted
-
     def add(self, messages: Messages) -> None:
-        """Decode these messages."""
-        for decoded, columns in self._decoder.decode(messages):
-            if not len(decoded):  # messages of empty arrays
+        """Take these messages; what waits is decoded once it is much."""
+        self._decoder.add(messages)
+        if self._decoder.waiting >= _TOGETHER:
+            self.decode()
+
+    def decode(self) -> None:
+        """Decode the messages that wait."""
+        for heads, columns in self._decoder.decoded():
+            if not len(heads.ordinal):  # messages of empty arrays
                 continue
-            values: dict[str, Values] = {ORDINAL: decoded.ordinal, **columns}
-            values |= {LOG_TIME: decoded.log_time} if LOG_TIME in self._times else {}
-            values |= {PUBLISH_TIME: decoded.publish_time} if PUBLISH_TIME in self._times else {}
+            values: dict[str, Values] = {ORDINAL: heads.ordinal, LOG_TIME: heads.log_time, **columns}
+            if heads.publish_time is not None:
+                values[PUBLISH_TIME] = heads.publish_time
             for name, parts in self._parts.items():
                 parts.append(values[name])
 
     def frame(self) -> pl.DataFrame:
-        """One row per message in order of the file; what was collected is given up."""
+        """One row per decoded message in order of the file; what was collected is given up."""
         places = _concat_parts(self._parts[ORDINAL], pl.Int64())
         order = None if places.is_sorted() else np.argsort(places.to_numpy(), kind="stable")
         return pl.DataFrame(
@@ -78,4 +86,4 @@ def _concat_parts(parts: list[Values], dtype: pl.DataType, order: Ints | None = 
         values = np.concatenate(arrays)
         return pl.Series(values if order is None else values[order], dtype=dtype)
     whole = pl.concat([pl.Series(dtype=dtype), *(pl.Series(part, dtype=dtype) for part in parts)], rechunk=True)
-    return whole if order is None else whole.gather(order)
+    return whole if order is None or whole.null_count() == len(whole) else whole.gather(order)

@@ -143,7 +143,9 @@ def whole_stream(odometer: pl.DataFrame, config: IngestConfig) -> tuple[pl.DataF
 
     Left as it is where the configuration corrects that itself (`[[ingest.correct]] wrap`).
     """
-    if odometer.is_empty() or any(made.stream == "odometer" and made.wrap for made in config.correct):
+    if odometer["distance_m"].null_count() == odometer.height:
+        return odometer, []
+    if any(made.stream == "odometer" and made.wrap for made in config.correct):
         return odometer, []
     t_ns = times_ns(odometer)
     whole, found = with_whole_counts(odometer["distance_m"], t_ns, None, odometer["sensor"], config.wraps)

@@ -21,6 +21,8 @@ def hazard_words(hazards: pl.DataFrame, passages: pl.DataFrame) -> list[str]:
 
     `passages`: of the same run, for where the balises were that it had accepted.
     """
+    if hazards.is_empty():
+        return []
     faults = hazards.filter(pl.col("caused_by").is_null())
     wrong = _wrong_acceptances(passages)
     ranked = sorted(faults.iter_rows(named=True), key=_badness)

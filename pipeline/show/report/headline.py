@@ -15,7 +15,7 @@ from pipeline.show.report.words import WORDS, plural, some_of
 from schemas.enums import Origin, Reason, RunVerdict
 from schemas.frozen import frozen
 from schemas.run import RunTables
-from schemas.words import part_words, reason_words, say, unnoticed_words, verdict_figures_words
+from schemas.words import JUDGES, part_words, reason_words, say, unnoticed_words, verdict_figures_words
 
 _ALL_SAFE = "every acceptance right, every position failure within the time allowed, in all runs"
 
@@ -117,7 +117,6 @@ _COUNTED = (
     ("faults not found in time", "missed_detections", "bad"),
     ("accepted, could not be checked", "unproven_accepted", "doubt"),
 )
-JUDGES = {"reference": "a reference", "balise": "balise reads", "odometer": "the odometer alone"}
 
 
 def facts(rows: Sequence[Row], tables: RunTables, metadata: Mapping[str, str]) -> list[tuple[str, str]]:

@@ -15,7 +15,7 @@ from pipeline.results.places import origin_of
 from pipeline.show.report.balises import architectures_section, balise_table, lost_shares, outcome
 from pipeline.show.report.columns import Row, figures, frame_table
 from pipeline.show.report.ground import plan_data
-from pipeline.show.report.headline import FILES, JUDGES, facts, file_table, run_headline, tile_figures
+from pipeline.show.report.headline import FILES, facts, file_table, run_headline, tile_figures
 from pipeline.show.report.markup import (
     Cell,
     Json,
@@ -38,7 +38,7 @@ from schemas.enums import TRUTH
 from schemas.frozen import frozen
 from schemas.run import RunTables, Site
 from schemas.tables import Alarms, Hazards, Passages, Runs
-from schemas.words import notes_apart
+from schemas.words import JUDGES, notes_apart
 
 # The first ten are shown, the others behind a switch.
 _HAZARDS = (

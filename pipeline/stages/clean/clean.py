@@ -56,7 +56,7 @@ def require_spans(run: RunLog, config: IngestConfig) -> None:
     """Refuse streams other than the positions that last too long; of positions each solution is asked."""
     odometers = [("odometer", odometer) for odometer in (run.odometer, *run.other_odometers)]
     satellites = [] if run.satellites is None else run.satellites.partition_by("solution", maintain_order=True)
-    others = [("reference", run.reference), ("balise_reads", run.balise_reads)]
+    others = [(name, run.stream(name)) for name in _OF_POSITIONS if name != "satellites"]
     for name, frame in [*odometers, *(("satellites", part) for part in satellites), *others]:
         if frame is not None:
             require_span(frame["t"], f"{run.run_id}: {name}", config)
@@ -86,7 +86,7 @@ _SOURCES = ("solution", "sensor")
 """Columns that part a stream into sources, each with its own order of time."""
 _PLACE = ("latitude_deg", "longitude_deg")
 # Streams that say something only of positions: without them a run is replayed all the same.
-_OF_POSITIONS: tuple[Stream, ...] = ("satellites", "reference", "balise_reads")
+_OF_POSITIONS = tuple(name for name in STREAMS if name not in ("gnss", "odometer", "faults"))
 ClockAdvice = Callable[[RunLog], str]
 """What moves recorders of different times to one journey, in a sentence; empty where nothing does."""
 

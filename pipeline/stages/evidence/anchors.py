@@ -285,7 +285,7 @@ def read_anchors(
 
 
 def on_clock(anchors: Sequence[TrueAnchor], clock: RecorderClock, counter: SignedOdometer | None) -> list[TrueAnchor]:
-    """The reads on the odometer's clock, with what that clock may add at their speed; nothing without an odometer."""
+    """Anchors on the odometer's clock, with what their own may add at their speed; nothing without an odometer."""
     t_ns = np.array([anchor.t_ns for anchor in anchors], dtype=np.int64)
     speed_mps = np.zeros(t_ns.size) if counter is None else np.abs(counter.odometer.speed_about(t_ns))
     clock_m = clock.delta_s * speed_mps

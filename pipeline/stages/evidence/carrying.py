@@ -347,20 +347,24 @@ def clock_of(lags: Sequence[Lags], independent: bool, config: HazardConfig) -> R
     return RecorderClock(0.5 * (low_s + high_s), max(0.5 * (high_s - low_s), least_s), assumed=not independent)
 
 
-def clocks_of(
-    lags: tuple[Sequence[Lags], Sequence[Lags]], independent: bool, config: HazardConfig
-) -> tuple[RecorderClock, RecorderClock]:
-    """Clocks of reference and reads. One that cannot be measured may be the odometer's or that of the other."""
-    first, second = (clock_of(of_one, independent, config) for of_one in lags)
-    return _toward_measured_clock(first, second, config), _toward_measured_clock(second, first, config)
+def clocks_of(lags: Sequence[Sequence[Lags]], independent: bool, config: HazardConfig) -> list[RecorderClock]:
+    """One for each recorder. One that cannot be measured may have the odometer's clock or that of any other."""
+    clocks = [clock_of(of_one, independent, config) for of_one in lags]
+    return [
+        _toward_measured_clocks(clock, [*clocks[:number], *clocks[number + 1 :]], config)
+        for number, clock in enumerate(clocks)
+    ]
 
 
-def _toward_measured_clock(clock: RecorderClock, other: RecorderClock, config: HazardConfig) -> RecorderClock:
-    """A clock that is only assumed, wide enough to hold the odometer's and that of the other recorder."""
-    if not clock.assumed or other.shift_s == 0.0:
+def _toward_measured_clocks(
+    clock: RecorderClock, others: Sequence[RecorderClock], config: HazardConfig
+) -> RecorderClock:
+    shifts_s = [0.0, *(other.shift_s for other in others)]
+    low_s, high_s = min(shifts_s), max(shifts_s)
+    if not clock.assumed or low_s == high_s:
         return clock
-    middle_s = 0.5 * other.shift_s
-    delta_s = abs(clock.shift_s - middle_s) + abs(middle_s) + config.evidence_clock_s
+    middle_s = 0.5 * (low_s + high_s)
+    delta_s = abs(clock.shift_s - middle_s) + 0.5 * (high_s - low_s) + config.evidence_clock_s
     return RecorderClock(middle_s, delta_s, assumed=True)
 
 

@@ -260,8 +260,7 @@ class TrainEvidence:
                     there = Alternative(rows, route.chain.route(self.network), low_m, high_m).where(np.isfinite(low_m))
                     alternatives.append(there)
                     open_rows[there.rows] = False
-                    by_read = any(anchor.kind is Kind.BALISE for anchor in gap.anchors)
-                    shown.kind[there.rows] = KINDS.index(Kind.BALISE if by_read else Kind.REFERENCE)
+                    shown.kind[there.rows] = max(KINDS.index(anchor.kind) for anchor in gap.anchors)
                     at_anchor = np.isin(t_ns[there.rows], [anchor.t_ns for anchor in gap.anchors if anchor.proved])
                     shown.proves[there.rows] = source.counter.odometer.independent | at_anchor
                     shown.on_survey[there.rows] = gap.on_survey(self.network) | at_anchor

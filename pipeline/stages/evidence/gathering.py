@@ -5,9 +5,11 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import replace
 from itertools import pairwise
+from typing import NamedTuple
 
 import numpy as np
 import polars as pl
+import pyarrow as pa
 
 from pipeline.stages.evidence.anchors import (
     KnownStretch,
@@ -15,7 +17,6 @@ from pipeline.stages.evidence.anchors import (
     final_stands,
     on_clock,
     outside,
-    read_anchors,
     reference_movements,
     shown_on_its_track,
     sided,
@@ -49,6 +50,7 @@ from pipeline.stages.track.survey import SurveyedTrack
 from schemas.arrays import NS_PER_S, Floats, Ints, floats, times_ns
 from schemas.config import Configuration, HazardConfig, Vehicle
 from schemas.enums import Origin
+from schemas.frozen import frozen
 
 
 def on_time(stream: pl.DataFrame | None, latency_s: float) -> pl.DataFrame | None:
@@ -202,8 +204,7 @@ _PARTED_S = 60.0
 
 def evidence_of(
     reference: tuple[Sequence[ReferenceStretch], Sequence[Span]],
-    reads: pl.DataFrame | None,
-    balises: pl.DataFrame | None,
+    recorders: Sequence[Sequence[TrueAnchor]],
     odometers: Sequence[Odometry],
     network: Network,
     vehicle: Vehicle,
@@ -216,8 +217,7 @@ def evidence_of(
 
     Args:
         reference: stretches of the reference and spans off the track [ns], as from `reference_stretches`.
-        reads: telegrams received (`t`, `balise_id`), or None.
-        balises: balises of the site, or None.
+        recorders: anchors of each other recorder of places, by its own clock, in order of time.
         odometers: all odometers, that of the LDS first.
         network: the track network, its elements not in pieces.
         vehicle: the place of the GNSS antenna [m].
@@ -243,10 +243,12 @@ def evidence_of(
     lags = [_lags_of_reference(stretches, search, least_m) for search in searches]
     # Any odometer contradicts a reference; where one is independent, the others are not asked.
     found = [Witness.of(*of_one, config) for of_one in zip(counters, lags, strict=True)]
-    read = read_anchors(reads, balises, network.track, hazards)
-    lags_of_reads = [_lags_of_reads(search.carried(_points(read)), config) for search in searches]
-    of_reference, of_reads = clocks_of((lags, lags_of_reads), bool(independent), hazards)
-    clocked = on_clock(read, of_reads, main)
+    lags_of_others = [
+        [_lags_of_anchors(search.carried(_points(anchors)), config) for search in searches] for anchors in recorders
+    ]
+    of_reference, *of_others = clocks_of((lags, *lags_of_others), bool(independent), hazards)
+    by_recorder = [on_clock(anchors, clock, main) for anchors, clock in zip(recorders, of_others, strict=True)]
+    clocked = sorted((anchor for anchors in by_recorder for anchor in anchors), key=lambda anchor: anchor.t_ns)
     recorded, unclosed = _known_stretches(sides, of_reference, found, clocked, searches, vehicle, config)
     known = tuple(part for stretch in recorded for part in stretch.trusted())
     unsure = [span for stretch in recorded for span in stretch.doubtful_spans()]
@@ -258,19 +260,24 @@ def evidence_of(
         carried=tuple(search.carried(_borders(known, search.counter, apart)) for search in searches),
         by_reads=tuple(search.carried(_points(clocked)) for search in searches) if recorded else (),
         reads_ns=np.array([anchor.t_ns for anchor in clocked], dtype=np.int64),
-        clocks=(of_reference,) * bool(known) + (of_reads,) * bool(apart),
+        clocks=(of_reference,) * bool(known) + _used(of_others, [outside(anchors, known) for anchors in by_recorder]),
         network=network,
         config=config,
         stands=final_stands([stretch.reference for stretch in known], independent, config),
         parted=_parted(odometers, config),
         unsure=tuple(unsure),
-        true_clocks_s=true_clocks_s((of_reference,) * bool(known) + (of_reads,) * bool(clocked)),
+        true_clocks_s=true_clocks_s((of_reference,) * bool(known) + _used(of_others, by_recorder)),
         disputes=tuple(span for stretch in recorded for span in stretch.disputed),
         doubted=unclosed
         + sum(stretch.levels.doubts for stretch in recorded)
         + (0 if counters else sum(len(stretch.disputed) for stretch in recorded))
         + sum(len(of_one.found) > 1 for of_one in lags),
     )
+
+
+def _used(clocks: Sequence[RecorderClock], anchors: Sequence[Sequence[TrueAnchor]]) -> tuple[RecorderClock, ...]:
+    """The clocks of the recorders that have anchors."""
+    return tuple(clock for clock, of_one in zip(clocks, anchors, strict=True) if of_one)
 
 
 def _known_stretches(
@@ -324,8 +331,8 @@ def _lags_of_reference(stretches: Sequence[ReferenceStretch], search: GapSearch,
     return lags_of(begin_ns, end_ns, moved_m, sigma_m, search.counter, search.config)
 
 
-def _lags_of_reads(source: Carried, config: Configuration) -> Lags:
-    """The clock of the reads against an odometer's, by the distances between reads, whether they close or not."""
+def _lags_of_anchors(source: Carried, config: Configuration) -> Lags:
+    """The clock of a recorder against an odometer's, by the distances between its anchors, closed or not."""
     movements = [
         (gap.begin_ns, gap.end_ns, apart_m, float(np.linalg.norm([anchor.sigma_m for anchor in gap.anchors])))
         for gap in source.gaps
@@ -352,37 +359,72 @@ def _parted(odometers: Sequence[Odometry], config: Configuration) -> bool:
     return False
 
 
-def true_places(evidence: EvidenceSet, track: SurveyedTrack) -> pl.DataFrame:
-    """The evidence as columns of `epochs`.
+@frozen
+class TruePlaces:
+    """Where the train was at each instant by the evidence; shape (instants,)."""
+
+    netelement_ids: pl.Series
+    """Every net element that the evidence leaves, in the order of the survey; null where nothing is known."""
+    low_m: Floats
+    """Least measure where one net element is left [m]."""
+    high_m: Floats
+    """Largest measure there [m]."""
+
+    def at(self, rows: Ints) -> TruePlaces:
+        """Those of some instants."""
+        return TruePlaces(self.netelement_ids[rows], self.low_m[rows], self.high_m[rows])
+
+    def columns(self) -> list[pl.Series]:
+        """As they stand in `epochs`."""
+        return [
+            self.netelement_ids.alias("true_netelement_ids"),
+            pl.Series("true_measure_low_m", self.low_m, nan_to_null=True),
+            pl.Series("true_measure_high_m", self.high_m, nan_to_null=True),
+        ]
+
+
+def true_places(evidence: EvidenceSet, track: SurveyedTrack) -> TruePlaces:
+    """Every net element that one of the alternatives touches, with the measures on it.
 
     Args:
         evidence: where the train was, at n instants.
         track: the survey, whose elements the evidence numbers.
 
     Returns:
-        `true_netelement_ids`, in the order of the survey, `true_measure_low_m` and `true_measure_high_m` [m], n rows.
-        Null where nothing is known; the measures also where there are several net elements.
+        Net elements and measures [m] of n instants.
     """
     parts = [_touched(alternative) for alternative in evidence.alternatives]
-    touched = pl.concat([pl.DataFrame(schema=_TOUCHED), *parts])
-    elements = pl.col("element").unique().sort()
-    places = touched.group_by("row").agg(elements, low=pl.col("low").min(), high=pl.col("high").max())
-    alone = pl.col("element").list.len() == 1
-    names = pl.Series(track.ids, dtype=pl.String)
-    numbers = pl.Series(range(names.len()), dtype=pl.Int64)
-    rows = pl.DataFrame({"row": np.arange(evidence.kind.size)})
-    return rows.join(places, on="row", how="left", maintain_order="left").select(
-        true_netelement_ids=pl.col("element").list.eval(pl.element().replace_strict(numbers, names)),
-        true_measure_low_m=pl.when(alone).then("low"),
-        true_measure_high_m=pl.when(alone).then("high"),
-    )
+    row, element = (np.concatenate([np.zeros(0, np.int64), *(getattr(part, name) for part in parts)]) for name in _KEYS)
+    ends_m = [np.concatenate([np.zeros(0), *(getattr(part, name) for part in parts)]) for name in ("low_m", "high_m")]
+    order = np.lexsort((element, row))
+    row, element, low_m, high_m = (values[order] for values in (row, element, *ends_m))
+    size = evidence.kind.size
+    begins = np.flatnonzero(np.diff(row, prepend=-1))
+    # Each net element once an instant, however often the train's routes lead over it.
+    once = np.diff(row * len(track.ids) + element, prepend=-1) != 0
+    counts = np.bincount(row[once], minlength=size)
+    places_m = np.full((2, size), np.nan)
+    if begins.size:
+        places_m[:, row[begins]] = np.minimum.reduceat(low_m, begins), np.maximum.reduceat(high_m, begins)
+    names = pl.Series(track.ids, dtype=pl.String)[element[once]]
+    offsets = np.concatenate([[0], np.cumsum(counts)]).astype(np.int32)
+    lists = pa.ListArray.from_arrays(pa.array(offsets), names.to_arrow(), mask=pa.array(counts == 0))
+    return TruePlaces(pl.Series(lists, dtype=pl.List(pl.String)), *np.where(counts == 1, places_m, np.nan))
 
 
-_TOUCHED = {"row": pl.Int64, "element": pl.Int64, "low": pl.Float64, "high": pl.Float64}
+_KEYS = ("row", "element")
 
 
-def _touched(there: Alternative) -> pl.DataFrame:
-    """Every net element that the interval touches, with the measures on it: one row per instant and visit."""
+class _Touched(NamedTuple):
+    """Net elements that an interval touches: one each instant and visit."""
+
+    row: Ints
+    element: Ints
+    low_m: Floats
+    high_m: Floats
+
+
+def _touched(there: Alternative) -> _Touched:
     route = there.route
     first, last = (
         np.maximum(np.searchsorted(route.entry_m, at_m, side="right") - 1, 0) for at_m in (there.low_m, there.high_m)
@@ -397,10 +439,9 @@ def _touched(there: Alternative) -> pl.DataFrame:
         np.clip(at_m[numbers] - route.entry_m[visit], 0.0, high - low) for at_m in (there.low_m, there.high_m)
     )
     forward = route.forward[visit]
-    columns = {
-        "row": there.rows[numbers],
-        "element": route.element[visit],
-        "low": np.where(forward, low + begin, high - end),
-        "high": np.where(forward, low + end, high - begin),
-    }
-    return pl.DataFrame(columns, schema=_TOUCHED)
+    return _Touched(
+        row=there.rows[numbers],
+        element=route.element[visit],
+        low_m=np.where(forward, low + begin, high - end),
+        high_m=np.where(forward, low + end, high - begin),
+    )

@@ -291,6 +291,11 @@ class LinkDistance:
         self._since_return[:, epoch:] = np.nan
         self._since_return[:, epoch : epoch + moved_m.size] = moved_m, bound_m
 
+    @property
+    def measures(self) -> bool:
+        """There is something to measure from."""
+        return self._anchor is not None
+
     def can_measure(self, epoch: int) -> bool:
         """Nothing of the odometer's distance since the anchor is in doubt."""
         doubt_m = self._journey.doubt_m

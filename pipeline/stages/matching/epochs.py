@@ -250,7 +250,10 @@ def matched_epochs(
     feet = placed.feet
     antenna_m = placed.antenna_m
     path_m = antenna_m - vehicle.gnss_antenna_ahead_m
-    element, measure_m = path.locate_index(assignment.leg, path_m)
+    piece, measure_m = path.locate_index(assignment.leg, path_m)
+    # The path's track may hold a net element in pieces, one after the other.
+    numbers = {name: number for number, name in enumerate(dict.fromkeys(path.track.ids))}
+    of_piece = [numbers[name] for name in path.track.ids]
     # The track's direction counts where the GNSS antenna is, not the balise antenna.
     shape = shape_at(path, assignment.leg, antenna_m)
     sigma_along_m, sigma_cross_m = track_sigmas_m(fixes, shape)
@@ -263,8 +266,8 @@ def matched_epochs(
         t_ns=fixes.t_ns,
         solution=written.solution,
         leg=np.where(fixes.valid, assignment.leg, -1),
-        element=element,
-        elements=path.track.ids,
+        element=np.array([*of_piece, -1])[piece],
+        elements=list(numbers),
         measure_m=measure_m,
         path_m=path_m,
         cross_track_m=feet.offset_m,

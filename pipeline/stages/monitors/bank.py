@@ -138,7 +138,7 @@ def _across(
     """Cross-track or vertical; the chord error of a coarse survey is one more correlated source."""
     rows = np.flatnonzero(reasons == NO_REASON)
     dt, fresh = time_steps(t_s[rows], config.align.gap_reset_s)
-    element = epochs.netelement_id.rle_id().to_numpy()[rows]
+    visit = np.cumsum(np.diff(epochs.element, prepend=epochs.element[:1]) != 0)[rows]
     survey = np.nan_to_num(epochs.survey_sigma_m[rows], nan=config.matching.survey_sigma_default_m)
     if axis == "cross":
         position_m, sigma_m, digits_m = epochs.cross_track_m, epochs.calibrated_cross_m, epochs.digits_cross_m
@@ -154,7 +154,7 @@ def _across(
     return AxisSeries(
         epoch=rows,
         fresh=fresh,
-        border=np.diff(element, prepend=element[:1]) != 0,
+        border=np.diff(visit, prepend=visit[:1]) != 0,
         dt_s=dt,
         rate_mps=_steps(position_m[rows]) / dt,
         **errors_of(sigma_m[rows], dt, further, config.monitors),
@@ -411,6 +411,14 @@ class MonitorBank:
         ahead = self._stops[epoch : min(self._known_to + 1, end)]
         first = int(ahead.argmax())
         return epoch + (first if ahead[first] else ahead.size)
+
+    def hidden_until(self, epoch: int, end: int) -> int:
+        """The first epoch from `epoch` on, at most `end`, at which the fast noise is known or something fails."""
+        self._look(epoch)
+        part = slice(epoch, min(self._known_to + 1, end))
+        shown = self._noise_known[part] | self._any[part]
+        first = int(shown.argmax())
+        return epoch + (first if shown[first] else shown.size)
 
     def along_evaluated_between(self, epoch: int, end: int) -> Bools:
         """Whether the axis along is evaluated at epochs for which `quiet_until` answered."""

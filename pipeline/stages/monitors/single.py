@@ -76,9 +76,7 @@ def _doppler_sigma(epochs: AlignedEpochs, span_s: Floats, change_mps: Floats, co
     return np.sqrt(variance)
 
 
-def channel_monitor(
-    epochs: pl.DataFrame, channel: pl.DataFrame | None, config: Configuration, absent: NotEvaluated = NO_OTHER_SOLUTION
-) -> Verdicts:
+def channel_monitor(epochs: pl.DataFrame, channel: pl.DataFrame, config: Configuration) -> Verdicts:
     """Path positions of two solutions at the same time against each other.
 
     The last position of the other since the epoch before counts (`paired`). Errors common to both make the threshold
@@ -86,9 +84,8 @@ def channel_monitor(
 
     Args:
         epochs: `t, path_m, sigma_along_m, fix_valid, on_track` of this solution, n rows.
-        channel: the same of the other solution, on the same path; None without one.
+        channel: the same of the other solution, on the same path.
         config: the configuration; used are `monitors.threshold_factor` and `lds`.
-        absent: the reason where there is no other solution.
 
     Returns:
         Verdicts of n rows; value and threshold [m].
@@ -96,8 +93,6 @@ def channel_monitor(
     Source:
         LOC Fig. 3; DOMAIN section 3.
     """
-    if channel is None:
-        return no_verdicts(epochs.height, absent)
     usable = channel.filter("fix_valid", "on_track")
     own_m = pl.when(pl.col("fix_valid") & pl.col("on_track")).then("path_m")
     pairs = paired(epochs.select("t", path_m=own_m), usable, config.lds)
@@ -210,7 +205,11 @@ class MonitorInput:
 
 WITHOUT_MEMORY: Mapping[str, Callable[[MonitorInput], Verdicts]] = {
     "along_doppler": lambda given: doppler_monitor(given.epochs, given.config),
-    "channel": lambda given: channel_monitor(given.epochs.table, given.other, given.config, given.absent),
+    "channel": lambda given: (
+        no_verdicts(given.epochs.height, given.absent)
+        if given.other is None
+        else channel_monitor(given.epochs.table, given.other, given.config)
+    ),
     "pseudorange": lambda given: pseudorange_monitor(given.epochs, given.satellites, given.config),
 }
 """Monitors by the name that `schemas.tables.ALL_MONITORS` gives them."""

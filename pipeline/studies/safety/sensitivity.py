@@ -61,7 +61,7 @@ def _with_allowed(row: Row, allowed_s: float, config: Configuration) -> Row:
         return row
     within, beyond = level_counts(failures_in(row), allowed_s)
     counted = {**row, "failures_within_budget": within, "failures_beyond_budget": beyond}
-    reasons = reasons_of(counted, allowed_s, config.hazards.undiagnosed_share)
+    reasons = reasons_of(counted, allowed_s, config.hazards)
     return {**counted, "reasons": reasons, "verdict": verdict_of(reasons).value}
 
 

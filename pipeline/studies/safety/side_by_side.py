@@ -9,10 +9,11 @@ from __future__ import annotations
 
 from itertools import combinations
 
+import numpy as np
 import polars as pl
 
 from pipeline.stages.epochs.clock import Clock, held_s, holds, may_move, nominal_period_s, position_ns, trusted, uptime
-from pipeline.stages.epochs.verdicts import FailureLog, failure_log
+from pipeline.stages.epochs.verdicts import FailureLog, Verdicts, failure_log
 from pipeline.stages.monitors.single import channel_monitor, on_path_of, paired
 from pipeline.stages.run_row.bounds import independent_episodes
 from pipeline.stages.run_row.run_figures import judged as judged_epoch
@@ -164,9 +165,9 @@ def _states(solution: SolutionTables, position: pl.Expr) -> pl.DataFrame:
 
 def _channel(epochs: pl.DataFrame, monitors: tuple[str, ...], judged: pl.Expr, config: Configuration) -> _Diagnosed:
     """`epochs`: `_states`, with the columns of `monitors` and those that `judged` takes."""
-    columns = [f"{name}_{part}" for name in monitors for part in ("state", "value", "threshold")]
-    fails = failure_log(epochs.select("t", *columns, negated=pl.lit(value=False)), config.lds.recovery_s)
     clock = Clock.of(epochs, config)
+    verdicts = {name: Verdicts.of_table(epochs, name) for name in monitors}
+    fails = failure_log(clock.t_ns, np.zeros(clock.t_ns.size, dtype=np.bool_), verdicts, config.lds.recovery_s)
     evaluated = holds(epochs, judged)
     working = evaluated & holds(epochs, pl.col("trusted"))
     for span in fails.alarms:

@@ -7,6 +7,7 @@ import numpy as np
 import polars as pl
 
 from pipeline.stages.epochs.clock import crossing_gaps_ns
+from pipeline.stages.judge.judged import JudgedEpochs
 from pipeline.stages.monitored import MonitoredSolution
 from pipeline.studies.undetected.error import largest_errors
 from pipeline.studies.undetected.figures import Spacing, undetected_figures
@@ -14,7 +15,7 @@ from pipeline.studies.undetected.in_use import Returns, in_use_errors
 from pipeline.studies.undetected.position_tests import bounded, range_bounds, with_channel
 from pipeline.studies.undetected.spacing import largest_spacing
 from pipeline.studies.undetected.watched import NO_ROW, FaultWindow, Watched, fixes_ns, watched, windows
-from schemas.arrays import Bools, Floats, Ints, flags, floats, ints, times_ns
+from schemas.arrays import Bools, Floats, Ints, flags, floats, ints
 from schemas.config import Configuration, UndetectedConfig
 from schemas.conform import dtypes
 from schemas.enums import BaliseKind
@@ -34,9 +35,11 @@ class Undetected:
     passages: pl.DataFrame
     spacing: Spacing | None = None
 
-    def figures(self, epochs: pl.DataFrame, config: Configuration) -> dict[str, object]:
-        """Columns of the `runs` row, over judged epochs; none where nothing was computed."""
-        return undetected_figures(epochs, self.spacing, config.hazards.limits.failure_m)
+    def figures(self, epochs: JudgedEpochs, config: Configuration) -> dict[str, object]:
+        """Columns of the `runs` row; none where nothing was computed."""
+        if self.spacing is None:
+            return {}
+        return undetected_figures(epochs, self.epochs, self.spacing, config.hazards.limits.failure_m)
 
 
 def unnoticed_of(monitored: MonitoredSolution) -> Undetected:
@@ -54,10 +57,10 @@ def unnoticed_of(monitored: MonitoredSolution) -> Undetected:
         DOMAIN section 5.6; docs/undetected.md.
     """
     config = monitored.prepared.config
-    epochs = monitored.solution.epochs
     nothing = _nothing(Passages, monitored.lds.passages.height)
     if not config.undetected.compute:
-        return Undetected(_nothing(Epochs, epochs.height), nothing)
+        return Undetected(_nothing(Epochs, monitored.solution.epochs.height), nothing)
+    epochs = monitored.solution.epochs.table
     rows = rows_of(monitored)
     parts = windows_of(monitored, rows)
     errors = _both(rows, parts, config.undetected)
@@ -97,7 +100,7 @@ def rows_of(monitored: MonitoredSolution) -> Watched:
     """What the monitors watched, the comparison with another solution where the fault is in one alone."""
     prepared = monitored.prepared
     config = prepared.config
-    epochs = monitored.solution.epochs
+    epochs = monitored.solution.epochs.table
     rows = watched(epochs, monitored.bank.along(), monitored.lds.held, prepared.vehicle, config)
     if config.undetected.solutions_at_fault == "all":
         return rows
@@ -110,7 +113,7 @@ def windows_of(monitored: MonitoredSolution, rows: Watched) -> list[FaultWindow]
     fixes = fixes_ns(
         prepared.run, monitored.lds.crossings, prepared.config.lds.starts_of_mission, prepared.config.undetected
     )
-    return windows(rows, times_ns(monitored.solution.epochs), fixes)
+    return windows(rows, monitored.solution.epochs.t_ns, fixes)
 
 
 @frozen
@@ -148,7 +151,7 @@ def _in_use_m(monitored: MonitoredSolution, rows: Watched, parts: list[FaultWind
     """The largest error while the position is in use, alarms or not, shape (2, rows)."""
     config = monitored.prepared.config
     vehicle = monitored.prepared.vehicle
-    epochs = monitored.solution.epochs
+    epochs = monitored.solution.epochs.table
     returns = None
     # No negated position returns between fixes without a re-link, or a vehicle file to compare with.
     if config.lds.relink and vehicle.odometer_scale is not None and vehicle.odometer_scale_sigma is not None:
@@ -180,12 +183,11 @@ def rows_of_passages(monitored: MonitoredSolution, rows: Watched) -> Ints:
     Of a virtual balise the epoch that offered it. Of a physical one the last row before its telegram, no longer before
     than a crossing may be seen over: that is how wrong the position can have become since the read before.
     """
-    epoch_of = monitored.lds.crossings.select("crossing_id", "epoch")
-    passages = monitored.lds.passages.join(epoch_of, on="crossing_id", how="left", maintain_order="left")
+    passages = monitored.lds.passages
     if not rows.rows:
         return np.full(passages.height, NO_ROW)
-    t_ns = times_ns(monitored.solution.epochs)
-    wanted = ints(passages["epoch"])
+    t_ns = monitored.solution.epochs.t_ns
+    wanted = np.append(monitored.lds.crossings.epoch, -1)[ints(passages["crossing_id"])]
     row = np.searchsorted(rows.epoch, wanted).clip(max=rows.rows - 1)
     offered = np.where((wanted >= 0) & (rows.epoch[row] == wanted), row, NO_ROW)
     read_ns = ints(passages["t_offered"].dt.timestamp("ns"))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import polars as pl
 
+from pipeline.stages.judge.judged import JudgedEpochs
 from schemas.frozen import frozen
 
 
@@ -22,12 +23,14 @@ class Spacing:
     reached: int = 0
 
 
-def undetected_figures(epochs: pl.DataFrame, spacing: Spacing | None, limit_m: float) -> dict[str, object]:
-    """Figures of the `runs` row, over the epochs whose position was in use; all null where nothing was computed."""
-    if spacing is None:
-        return {}
+def undetected_figures(
+    epochs: JudgedEpochs, undetected: pl.DataFrame, spacing: Spacing, limit_m: float
+) -> dict[str, object]:
+    """Figures of the `runs` row, over the epochs whose position was in use; `undetected`: its columns of `epochs`."""
     larger = pl.max_horizontal("undetected_ahead_m", "undetected_behind_m")
-    known = epochs.filter("in_use").select("t", "path_m", larger=larger).drop_nulls("larger")
+    at = {"t_ns": epochs.t_ns, "path_m": epochs.path_m, "in_use": epochs.in_use}
+    known = undetected.with_columns(larger=larger, **{name: pl.Series(values) for name, values in at.items()})
+    known = known.filter(pl.col("in_use") & larger.is_not_null())
     figures: dict[str, object] = {
         "physical_spacing_m": spacing.distance_m,
         "physical_spacing_s": spacing.time_s,
@@ -42,6 +45,6 @@ def undetected_figures(epochs: pl.DataFrame, spacing: Spacing | None, limit_m: f
         "undetected_p95_m": known["larger"].quantile(0.95, interpolation="higher"),
         "undetected_max_m": known["larger"].max(),
         "undetected_share_beyond": beyond.height / known.height,
-        "t_undetected_beyond": None if beyond.is_empty() else beyond["t"].dt.timestamp("ns")[0],
+        "t_undetected_beyond": None if beyond.is_empty() else beyond["t_ns"][0],
         "undetected_beyond_path_m": None if beyond.is_empty() else beyond["path_m"][0],
     }

@@ -36,7 +36,7 @@ class FaultProfile:
 
 def profile_at(monitored: MonitoredSolution, epoch: int, behind: bool) -> FaultProfile:
     """The largest unnoticed fault at an epoch, ahead or behind in the direction of travel there."""
-    epochs = monitored.solution.epochs
+    epochs = monitored.solution.epochs.table
     rows = rows_of(monitored)
     row = int(np.searchsorted(rows.epoch, epoch))
     window = next((part for part in windows_of(monitored, rows) if part.start < row <= part.end), None)
@@ -70,7 +70,7 @@ def epoch_of(monitored: MonitoredSolution, balise: str | None, at_s: float | Non
     rows = rows_of(monitored)
     passages = monitored.lds.passages
     if balise is None:
-        t_ns = times_ns(monitored.solution.epochs)
+        t_ns = monitored.solution.epochs.t_ns
         stamps = t_ns[rows.epoch]
         latest = stamps[-1:].sum() if at_s is None else t_ns[0] + round(at_s * NS_PER_S)
         row = int(np.searchsorted(stamps, latest, side="right")) - 1

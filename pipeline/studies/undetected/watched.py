@@ -19,9 +19,9 @@ from pipeline.stages.monitors.axis import ewma_weight
 from pipeline.stages.monitors.bank import AxisBank
 from schemas.arrays import NS_PER_S, Bools, Floats, Ints, flags, floats, times_ns
 from schemas.config import Configuration, UndetectedConfig, Vehicle
-from schemas.enums import BaliseKind
 from schemas.frozen import frozen
 from schemas.run import RunLog
+from schemas.stages import Crossings
 
 NO_ROW = -1
 _CURVE_COLUMNS = ("curvature_per_m", "cross_track_m")
@@ -218,7 +218,7 @@ def _with_relinks(rows: Watched, held: tuple[Held, ...]) -> Watched:
     return replace(rows, **bounds)
 
 
-def fixes_ns(run: RunLog, crossings: pl.DataFrame, missions: tuple[datetime, ...], config: UndetectedConfig) -> Ints:
+def fixes_ns(run: RunLog, crossings: Crossings, missions: tuple[datetime, ...], config: UndetectedConfig) -> Ints:
     """Instants at which something else than GNSS said where the train was, in order [ns].
 
     Physical balises read on the path, the reference by configuration, and configured starts of mission. The run's
@@ -226,7 +226,7 @@ def fixes_ns(run: RunLog, crossings: pl.DataFrame, missions: tuple[datetime, ...
     """
     times: list[Ints] = [np.array([round(t.timestamp() * 1e9) for t in missions], dtype=np.int64)]
     if "read" in config.fixes:
-        times.append(times_ns(crossings.filter(kind=BaliseKind.PHYSICAL.value)))
+        times.append(crossings.t_ns[~crossings.virtual])
     if "reference" in config.fixes and run.reference is not None:
         times.append(times_ns(run.reference))
     return np.unique(np.concatenate(times))

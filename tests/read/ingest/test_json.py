@@ -10,6 +10,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from pipeline.read.ingest import json_columns
 from pipeline.read.ingest.json_columns import JsonDecoder, one_by_one, parse_json
 from pipeline.read.ingest.layout import Columns, UndecodableError
 from pipeline.read.ingest.mcap_block import Messages, Records
@@ -64,8 +65,9 @@ def written(document: dict, style: dict, harm: tuple[int, str] | None) -> bytes:
 def at_once(contents: list[bytes], decoder: JsonDecoder | None = None) -> tuple[Columns, int]:
     """The columns, and how many messages were parsed one by one."""
     decoder = decoder or JsonDecoder(CHANNEL, TYPES)
-    ((found, columns),) = decoder.decode(messages_of(contents))
-    assert len(found) == len(contents)
+    decoder.add(messages_of(contents))
+    ((heads, columns),) = decoder.decoded()
+    assert len(heads.ordinal) == len(contents)
     return columns, decoder.slow_messages
 
 
@@ -74,7 +76,7 @@ def at_once(contents: list[bytes], decoder: JsonDecoder | None = None) -> tuple[
 def test_what_is_taken_at_once_is_what_the_parser_says(drawn):
     for content in (written(*one) for one in drawn):
         try:
-            expected = one_by_one(CHANNEL, messages_of([content]), TYPES)
+            expected = one_by_one(CHANNEL, [content], [1], TYPES)
         except InputError:
             with pytest.raises(InputError):
                 at_once([content])
@@ -83,6 +85,77 @@ def test_what_is_taken_at_once_is_what_the_parser_says(drawn):
         assert {path: values.to_list() for path, values in columns.items()} == {
             path: values.to_list() for path, values in expected.items()
         }
+
+
+alike = st.fixed_dictionaries(
+    {
+        "a": st.one_of(st.floats(allow_nan=False, allow_infinity=False), numbers, st.just(0)),
+        "t": st.fixed_dictionaries({"sec": st.one_of(st.integers(0, 2**40), numbers)}),
+        "name": st.one_of(st.just("x"), texts),
+        "ok": st.booleans(),
+    }
+)
+ALIKE = b'{"a":0.5,"t":{"sec":7},"name":"x","ok":true}'
+
+
+@settings(max_examples=300, deadline=None, derandomize=True)
+@given(st.lists(st.tuples(alike, styles, damage), min_size=1, max_size=4))
+def test_messages_that_hold_the_same_fields_are_what_the_parser_says(drawn):
+    contents = [ALIKE, *(written(*one) for one in drawn)]
+    try:
+        expected = one_by_one(CHANNEL, contents, range(len(contents)), TYPES)
+    except InputError:
+        with pytest.raises(InputError):
+            at_once(contents)
+        return
+    columns, _ = at_once(contents)
+    assert {path: values.dtype for path, values in columns.items()} == TYPES
+    assert {path: values.to_list() for path, values in columns.items()} == {
+        path: values.to_list() for path, values in expected.items()
+    }
+
+
+def test_messages_that_hold_the_same_fields_need_no_second_parser(monkeypatch):
+    monkeypatch.delattr(json_columns, "_read")
+    decoder = JsonDecoder(CHANNEL, TYPES)
+    for name in ("x", "é"):
+        contents = [ALIKE, b' {"ok": false, "t": {"sec": -3}, "a": 1e3, "name": "%s"}\n' % name.encode()]
+        columns, slow = at_once(contents, decoder)
+        assert slow == 0
+        assert {path: values.to_list() for path, values in columns.items()} == {
+            "a": [0.5, 1000.0], "t.sec": [7, -3], "name": ["x", name], "ok": [True, False], "c[1]": [None, None],
+        }  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    "content",
+    [
+        ALIKE.replace(b'"ok"', b'"a":0.5,"ok"'),
+        ALIKE.replace(b'"a"', b'"\\u0061":1,"a"'),
+        ALIKE.replace(b'"sec"', b'"sec":1,"sec"'),
+        ALIKE.replace(b'"ok"', b'"t":{"sec":7},"ok"'),
+        ALIKE.replace(b'"name"', b'"name":"","name"'),
+        ALIKE + b"," + ALIKE,
+        ALIKE + ALIKE,
+        ALIKE + b"\n" + ALIKE,
+        ALIKE.replace(b"7", b"7.5"),
+        ALIKE.replace(b"7", b"9223372036854775808"),
+        ALIKE.replace(b'"x"', b'"\xff"'),
+        ALIKE.replace(b'"x"', b'"\t"'),
+    ],
+)
+def test_a_bad_message_among_those_that_hold_the_same_fields_is_refused(content):
+    with pytest.raises(InputError, match="log time 1 ns"):
+        one_by_one(CHANNEL, [ALIKE, content], [0, 1], TYPES)
+    decoder = JsonDecoder(CHANNEL, TYPES)
+    at_once([ALIKE] * 2, decoder)
+    with pytest.raises(InputError, match=f"log time {len(ALIKE) + 2} ns"):
+        at_once([ALIKE, content], decoder)
+
+
+def test_zero_keeps_its_sign():
+    contents = [ALIKE, ALIKE.replace(b"0.5", b"-0"), ALIKE.replace(b"0.5", b"-0.0")]
+    assert [str(value) for value in at_once(contents)[0]["a"].to_list()] == ["0.5", "-0.0", "-0.0"]
 
 
 def test_good_messages_are_taken_at_once():

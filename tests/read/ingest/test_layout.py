@@ -29,11 +29,13 @@ def rows_of(contents: list[bytes], walk: Callable[[bytes], Layout]) -> tuple[lis
     records = Records([np.frombuffer(b"".join(contents), dtype=np.uint8)])
     messages = Messages(records, starts, lengths, np.arange(len(contents)))
     decoder = LayoutDecoder(CHANNEL, walk)
+    decoder.add(messages)
     parts = [
-        pl.DataFrame({"message": group.log_time, **{path: pl.Series(columns[path]) for path in sorted(columns)}})
-        for group, columns in decoder.decode(messages)
-        if len(group)
+        pl.DataFrame({"message": heads.log_time, **{path: pl.Series(columns[path]) for path in sorted(columns)}})
+        for heads, columns in decoder.decoded()
+        if len(heads.ordinal)
     ]
+    assert (decoder.waiting, [*decoder.decoded()]) == (0, [])
     return pl.concat(parts).sort("message", maintain_order=True).rows(), decoder.slow_messages
 
 

@@ -13,7 +13,7 @@ from mcap.writer import CompressionType, IndexType, Writer
 from mcap_ros2._dynamic import serialize_dynamic
 from polars.testing import assert_frame_equal
 
-from pipeline.read.ingest import mcap_walk, read_run
+from pipeline.read.ingest import mcap_walk, read_run, reader
 from pipeline.show.export.messages import descriptor, message_class
 from pipeline.show.export.position_messages import LOCATION_FIELDS, LOCATION_FIX
 from schemas.config import IngestConfig, StreamMapping
@@ -111,10 +111,11 @@ def ros_speed(name: str, speed: dict) -> bytes:
 
 
 def check(tmp_path, content: bytes, gnss: pl.DataFrame, odometer: pl.DataFrame | None, slow: int = 0) -> None:
-    """All chunks at once, and one by one: what the first ones hold is then read ahead of those that follow."""
-    for together in (mcap_walk._TOGETHER, 1):
+    """All chunks at once, and one by one, with what is taken of them decoded at once or as it comes."""
+    for together, decoded in ((mcap_walk._TOGETHER, reader._TOGETHER), (1, reader._TOGETHER), (1, 1)):
         with pytest.MonkeyPatch.context() as patch:
             patch.setattr(mcap_walk, "_TOGETHER", together)
+            patch.setattr(reader, "_TOGETHER", decoded)
             _check(tmp_path, content, gnss, odometer, slow)
 
 

@@ -7,6 +7,7 @@ import polars as pl
 import pytest
 
 from pipeline.stages.evidence import evidence_of
+from pipeline.stages.evidence.anchors import read_anchors
 from pipeline.stages.evidence.carrying import SignedOdometer, TrueAnchor, carried_forward
 from pipeline.stages.evidence.evidence import KINDS, _after_standing
 from pipeline.stages.evidence.gaps import Gap, GapSearch
@@ -72,7 +73,8 @@ BALISES = pl.DataFrame(
 def test_between_reads_both_tell_and_beside_them_five_metres_and_five_percent() -> None:
     """10 m each second: reads are true to 3 m at three sigmas and, by a clock of 0.1 s, to a metre more."""
     counted = counting(np.arange(0.0, 110.0, 10.0))
-    known = evidence_of(([], []), READS, BALISES, [counted], line("both"), Vehicle(), Configuration())
+    reads = read_anchors(READS, BALISES, line("both").track, HazardConfig())
+    known = evidence_of(([], []), [reads], [counted], line("both"), Vehicle(), Configuration())
     found = known.at(seconds(0, 3, 8))
     assert found.kind.tolist() == [KINDS.index(Kind.BALISE)] * 3
     rows = {int(row): (low, high) for one in found.alternatives for row, low, high in zip(
