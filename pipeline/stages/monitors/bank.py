@@ -300,7 +300,7 @@ class AxisBank:
         return float(known[-1]) * WHITE_PART if known.size else None
 
     def median_noise_m(self) -> tuple[float, ...]:
-        """Median noise at each of the lags [m]; empty where it never was known."""
+        """Median noise in the thresholds of each monitor [m]; empty where it never was known."""
         known = self.noise_m[np.isfinite(self.noise_m).all(axis=1)]
         return tuple(np.median(known, axis=0).tolist()) if known.size else ()
 
