@@ -63,7 +63,20 @@ class MonitoredSolution:
 def monitor_solution(
     prepared: PreparedRun, solution: str, matches: Mapping[str, Match], evidence: TrainEvidence
 ) -> MonitoredSolution:
-    """Align one matched solution with the odometer, monitor it, detect balises."""
+    """Align one matched solution with the odometer, monitor it, detect balises.
+
+    Args:
+        prepared: the run, its site and its odometer.
+        solution: the name of the solution.
+        matches: paths of this solution, and of the one that the channel monitor compares it with.
+        evidence: where the train was; used for the direction of travel alone, and only without an odometer.
+
+    Returns:
+        All that the train made of the solution.
+
+    Source:
+        DOMAIN sections 3 and 4.
+    """
     config = prepared.config
     matched = matches[solution]
     odometry = None if prepared.odometry is None else prepared.odometry.oriented(matched.odometer_sign)

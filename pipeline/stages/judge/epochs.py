@@ -209,7 +209,19 @@ class TimeInUse:
 
 
 def time_in_use(epochs: MonitoredEpochs, code: Ints, config: Configuration) -> TimeInUse:
-    """The time before each epoch that it accounts for; `code`: judgements, shape (epochs,)."""
+    """The time before each epoch that it accounts for.
+
+    Args:
+        epochs: of one solution, in order of time.
+        code: their judgements by number, shape (epochs,).
+        config: the configuration; used are `lds` and `hazards.reaction_s`.
+
+    Returns:
+        Whether each was in use, and its times [s].
+
+    Source:
+        DOMAIN section 5.3.
+    """
     known = epochs.positioned
     steps = _StepTimes.of(epochs, known, config)
     usable = epochs.trusted(config.lds) & ~epochs.withheld
@@ -300,7 +312,18 @@ def lds_states(negated: Bools, code: Ints, in_use: Bools, undiagnosed: Bools) ->
 
 
 def judged_epochs(given: JudgeInput, steps: OdometerSteps) -> JudgedEpochs:
-    """The epochs of the solution with evidence, judgement, direction, movement, time in use and state of the LDS."""
+    """The epochs of the solution with evidence, judgement, direction, movement, time in use and state of the LDS.
+
+    Args:
+        given: the solution and its evidence.
+        steps: what the odometer says of the steps between its epochs.
+
+    Returns:
+        The epochs in their order; errors in the direction of travel.
+
+    Source:
+        DOMAIN sections 5.2 and 5.3.
+    """
     epochs = given.solution.epochs
     config = given.config
     at_ns = given.instants_of_epochs()
@@ -356,9 +379,19 @@ def direction_by_evidence(
 
 
 def judged_offers(given: JudgeInput, epochs: JudgedEpochs) -> JudgedOffers:
-    """The offers of the LDS, every telegram among them; `epochs`: judged.
+    """The offers of the LDS, every telegram among them.
 
     Judged is the place of the balise: at the time of the telegram, or of the crossing less the GNSS latency.
+
+    Args:
+        given: the solution and its evidence.
+        epochs: its epochs as judged.
+
+    Returns:
+        The offers in order of time.
+
+    Source:
+        DOMAIN section 5.2.
     """
     crossings = given.solution.crossings
     rows = given.solution.offers

@@ -38,7 +38,18 @@ class HazardRow:
 
 
 def hazard_rows(episodes: Iterable[Episode], history: ErrorHistory) -> list[HazardRow]:
-    """At most one row per episode and class, and one for VBs that the jump back crosses; in order of time."""
+    """At most one row per episode and class, and one for VBs that the jump back crosses.
+
+    Args:
+        episodes: faults in order of time.
+        history: the positions and offers that they are of.
+
+    Returns:
+        Rows in order of time.
+
+    Source:
+        DIAG, VB Jump and VB Shift; DOMAIN section 5.3.
+    """
     return [row for episode in episodes for row in _of_episode(episode, history)]
 
 
@@ -145,7 +156,17 @@ def rate_mps(row: HazardRow, history: ErrorHistory) -> float | None:
 def hazards_table(
     rows: Sequence[HazardRow], given: JudgeInput, epochs: JudgedEpochs, history: ErrorHistory
 ) -> pl.DataFrame:
-    """Rows in order of time; `hazard_id` is the place in `rows`; `epochs`: judged."""
+    """The hazards of a solution as a table.
+
+    Args:
+        rows: hazards in order of time; `hazard_id` is the place among them.
+        given: the solution.
+        epochs: its epochs as judged.
+        history: the positions and offers that the rows are of.
+
+    Returns:
+        Rows of `schemas.tables.Hazards`.
+    """
     ids = {id(row): number for number, row in enumerate(rows)}
     values = [
         {

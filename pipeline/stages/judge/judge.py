@@ -58,7 +58,14 @@ Crossings = dict[str, list[TrueCrossing]]
 
 
 def crossings_of(given: JudgeInput) -> Crossings:
-    """Crossings of each balise of the path by the train, in a direction in which the balise is valid."""
+    """Crossings of each balise of the path by the train, in a direction in which the balise is valid.
+
+    Args:
+        given: the balises of the path, and the evidence.
+
+    Returns:
+        Crossings of each balise in order of time.
+    """
     balises = given.solution.balises.unique("balise_id", keep="first")
     index = given.evidence.network.track.index
     elements = [index.get(name, -1) for name in balises["netelement_id"]]
@@ -177,7 +184,18 @@ def passages_table(
 ) -> pl.DataFrame:
     """Passages of the LDS, and those of the train that it knows nothing of, with the columns of the evidence.
 
-    `undetected`: from each fault's onset to its detection.
+    Args:
+        given: the solution and its evidence.
+        epochs: its epochs as judged.
+        offers: its offers as judged; a passage finds its own by `crossing_id`.
+        rows: hazards, for the numbers of those that hit a passage.
+        undetected: spans from each fault's onset to its detection [ns].
+
+    Returns:
+        Rows of `schemas.tables.Passages`, in order of time.
+
+    Source:
+        CONTRACT section 3; SUBSET-026 3.4.4.
     """
     stamps = epochs.t_ns[epochs.positioned]
     crossings = crossings_of(given)
@@ -359,7 +377,17 @@ class Judged:
 
 
 def judge(given: JudgeInput) -> Judged:
-    """Judge one solution: epochs, offers, jumps, failures, episodes, then the rows."""
+    """Judge one solution: epochs, offers, jumps, failures, episodes, then the rows.
+
+    Args:
+        given: the solution as it was replayed, the evidence of its run, and its odometer.
+
+    Returns:
+        Hazards, alarms and passages as tables, and what was judged in arrays.
+
+    Source:
+        DOMAIN sections 5.2 to 5.5; DIAG, hazards.
+    """
     config = given.config
     steps = odometer_steps(given)
     given = replace(given, evidence=replace(given.evidence, stood=steps.stood))

@@ -144,8 +144,20 @@ def judge_positions(
 ) -> Judgements:
     """Wrong where it is too far ahead, or too far behind, for every alternative; right where it is right for all.
 
-    `legs`: of the path, coordinate `path_m`. The interval of the error spans the alternatives whose track joins the
-    position's, as only there a distance along the track exists.
+    The interval of the error spans the alternatives whose track joins the position's, as only there a distance along
+    the track exists.
+
+    Args:
+        positions: n positions on the network.
+        evidence: where the train was at the same n instants.
+        legs: the legs of the solution's path; their coordinate is `path_m`.
+        config: limits of an error [m].
+
+    Returns:
+        n judgements; errors along growing path.
+
+    Source:
+        DOMAIN section 5.2.
     """
     size = positions.element.size
     limit_m = config.limits.failure_m

@@ -65,9 +65,18 @@ _OF_LEVEL = {RunVerdict.UNSAFE: ThrVerdict.EXCEEDED, RunVerdict.UNPROVEN: ThrVer
 
 
 def reasons_of(run: RunRow, allowed_s: float, hazards: HazardConfig) -> list[Reason]:
-    """Why a run has its verdict, by the columns `DECISIVE` of its row (DOMAIN section 5.4).
+    """Why a run has its verdict.
 
-    `allowed_s`: allowed T_D; `hazards`: its limits.
+    Args:
+        run: its row, or the columns `DECISIVE` of it.
+        allowed_s: allowed T_D [s].
+        hazards: limits of the configuration.
+
+    Returns:
+        All reasons that apply, in the order of the enumeration.
+
+    Source:
+        DOMAIN section 5.4.
     """
     failures = failures_in(run)
     within, beyond = level_counts(failures, allowed_s)
@@ -91,7 +100,17 @@ def reasons_of(run: RunRow, allowed_s: float, hazards: HazardConfig) -> list[Rea
 
 
 def verdict_of(reasons: Iterable[Reason]) -> RunVerdict:
-    """The worst that applies; an assumed clock alone changes nothing (DOMAIN section 5.4)."""
+    """The worst that applies; an assumed clock alone changes nothing.
+
+    Args:
+        reasons: why a run is not safe.
+
+    Returns:
+        The verdict of the run.
+
+    Source:
+        DOMAIN section 5.4.
+    """
     against = set(reasons) - {Reason.CLOCK_ASSUMED}
     if against & _UNSAFE:
         return RunVerdict.UNSAFE
@@ -99,7 +118,18 @@ def verdict_of(reasons: Iterable[Reason]) -> RunVerdict:
 
 
 def level_rows(run: RunRow, config: Configuration) -> list[dict[str, object]]:
-    """One `runs` row against the allowed T_D of each service level, by the rules of the run's verdict."""
+    """One `runs` row against the allowed T_D of each service level, by the rules of the run's verdict.
+
+    Args:
+        run: the row by its columns.
+        config: the configuration; used are `safety` and `hazards`.
+
+    Returns:
+        By service level its allowed time [s], failures within and beyond it, and the verdict.
+
+    Source:
+        TVB eq. 7.
+    """
     failures = failures_in(run)
     in_time = ThrVerdict.KEPT if failures else ThrVerdict.NO_FAILURE
     rows: list[dict[str, object]] = []
