@@ -118,8 +118,8 @@ def _without_memory(
 ) -> dict[str, Verdicts]:
     named = prepared.config.monitors.channel_reference
     absent = NO_OTHER_SOLUTION if named in (None, solution) else NotEvaluated.OTHER_NOT_RECORDED
-    seen = MonitorInput(aligned, prepared.ranges(solution), channel, absent, prepared.config)
-    return {name: monitor(seen) for name, monitor in WITHOUT_MEMORY.items()}
+    given = MonitorInput(aligned, prepared.ranges(solution), channel, absent, prepared.config)
+    return {name: monitor(given) for name, monitor in WITHOUT_MEMORY.items()}
 
 
 def _reads_on_odometer(

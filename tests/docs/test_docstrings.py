@@ -23,8 +23,8 @@ from pipeline.stages.judge.judge import crossings_of, judge, passages_table
 from pipeline.stages.judge.judgement import judge_positions
 from pipeline.stages.matching.match import find_path
 from pipeline.stages.monitored import monitor_solution
+from pipeline.stages.monitors.axes import axes_of
 from pipeline.stages.monitors.axis import along_series, run_axis
-from pipeline.stages.monitors.bank import axes_of
 from pipeline.stages.monitors.pseudorange import pseudorange_monitor
 from pipeline.stages.monitors.single import WITHOUT_MEMORY, channel_monitor, doppler_monitor
 from pipeline.stages.paths.growth import path_set

@@ -158,8 +158,8 @@ def _reported_m(changes: list[LrvbChange], index: Ints, journey: Journey, config
     ]
     odometer_m, travelled_m, accuracy_m = np.array(values)[index].T
     distance_m = np.abs(journey.odometer_m - odometer_m)
-    way_m = np.maximum(np.abs(journey.travelled_m - travelled_m), distance_m)
-    return distance_m, accuracy_m + config.odometer_fixed_m + config.odometer_share * way_m
+    driven_m = np.maximum(np.abs(journey.travelled_m - travelled_m), distance_m)
+    return distance_m, accuracy_m + config.odometer_fixed_m + config.odometer_share * driven_m
 
 
 def _exposure_s(system: LocationSystem, journey: Journey) -> Floats:
