@@ -89,11 +89,12 @@ class TrainEvidence:
     """All evidence of a run.
 
     `off_track`: times with reference samples that lie on no track. `carried`: by each odometer from reads and the ends
-    of the reference, outside its time; `by_reads`: from reads alone, over the whole run. `standstills`: times over which
-    the odometer carries nothing from one side. `stands`: ends of recordings at which the train stood; `parted`: an odometer
-    of unknown origin parts from an independent one; `doubted`: steps and drifts of the reference that an odometer or a
-    read contradicts, and clocks that change; `unsure`: times in which nobody knows which of the two failed; `disputes`:
-    times about reads that exclude the reference; `true_clocks_s`: by how much the odometer's stamps may be early.
+    of the reference, outside its time; `by_reads`: from reads alone, over the whole run. `standstills`: times over
+    which the odometer carries nothing from one side. `stands`: ends of recordings at which the train stood; `parted`:
+    an odometer of unknown origin parts from an independent one; `doubted`: steps and drifts of the reference that an
+    odometer or a read contradicts, and clocks that change; `unsure`: times in which nobody knows which of the two
+    failed; `disputes`: times about reads that exclude the reference; `true_clocks_s`: by how much the odometer's stamps
+    may be early.
     """
 
     stretches: tuple[KnownStretch, ...]
