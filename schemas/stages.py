@@ -228,7 +228,14 @@ _ENUMERATIONS: Mapping[str, type[StrEnum]] = {
 
 
 def words_of(enumeration: type[StrEnum]) -> pl.Series:
-    """The words of an enumeration in its order, and null behind them, for numbers of -1."""
+    """The words of an enumeration, for `gathered`.
+
+    Args:
+        enumeration: an enumeration of words.
+
+    Returns:
+        Its words in their order, and null behind them, for numbers of -1.
+    """
     values = [one.value for one in enumeration]
     return pl.Series([*values, None], dtype=pl.Enum(values))
 
@@ -238,17 +245,41 @@ _WORDS = {name: words_of(enumeration) for name, enumeration in _ENUMERATIONS.ite
 
 
 def gathered(words: pl.Series, number: Ints) -> pl.Series:
-    """Words by their number, the last of them for -1."""
+    """Words by their number.
+
+    Args:
+        words: as `words_of` makes them; the last stands for -1.
+        number: numbers of words, shape (n,).
+
+    Returns:
+        Words of n rows.
+    """
     return words[pl.Series(np.where(number < 0, len(words) - 1, number).astype(np.uint32))]
 
 
 def instants(name: str, t_ns: Ints) -> pl.Series:
-    """Times [ns] as a column."""
+    """Times as a column.
+
+    Args:
+        name: of the column.
+        t_ns: times [ns since 1970, UTC], shape (n,).
+
+    Returns:
+        Times of n rows.
+    """
     return pl.Series(name, t_ns, dtype=pl.Int64).cast(INSTANT)
 
 
 def series_of(epochs: Any, name: str) -> pl.Series:
-    """One array of epochs as a column: words for numbers of words, null for what is not known."""
+    """One array of epochs as a column: words for numbers of words, null for what is not known.
+
+    Args:
+        epochs: a class of epochs in arrays, n of them.
+        name: of the array.
+
+    Returns:
+        The column of n rows, by the name that it has in tables.
+    """
     values = getattr(epochs, name)
     match name:
         case "t_ns":

@@ -13,8 +13,9 @@ import polars as pl
 
 from pipeline.campaign.plan import is_run
 from pipeline.make.receivers import gather
-from pipeline.make.receivers.convert import UnknownError, of_topics
+from pipeline.make.receivers.convert import of_topics
 from pipeline.make.receivers.csv import TABLES, names_file
+from pipeline.make.receivers.messages import UnknownError
 from pipeline.project.convert import Recordings
 from pipeline.read.ingest import read_run
 from pipeline.read.ingest.csv_draft import draft_mapping

@@ -63,7 +63,20 @@ class MonitoredSolution:
 def monitor_solution(
     prepared: PreparedRun, solution: str, matches: Mapping[str, Match], evidence: TrainEvidence
 ) -> MonitoredSolution:
-    """Align one matched solution with the odometer, monitor it, detect balises."""
+    """Align one matched solution with the odometer, monitor it, detect balises.
+
+    Args:
+        prepared: the run, its site and its odometer.
+        solution: the name of the solution.
+        matches: paths of this solution, and of the one that the channel monitor compares it with.
+        evidence: where the train was; used for the direction of travel alone, and only without an odometer.
+
+    Returns:
+        All that the train made of the solution.
+
+    Source:
+        DOMAIN sections 3 and 4.
+    """
     config = prepared.config
     matched = matches[solution]
     odometry = None if prepared.odometry is None else prepared.odometry.oriented(matched.odometer_sign)
@@ -105,8 +118,8 @@ def _without_memory(
 ) -> dict[str, Verdicts]:
     named = prepared.config.monitors.channel_reference
     absent = NO_OTHER_SOLUTION if named in (None, solution) else NotEvaluated.OTHER_NOT_RECORDED
-    seen = MonitorInput(aligned, prepared.ranges(solution), channel, absent, prepared.config)
-    return {name: monitor(seen) for name, monitor in WITHOUT_MEMORY.items()}
+    given = MonitorInput(aligned, prepared.ranges(solution), channel, absent, prepared.config)
+    return {name: monitor(given) for name, monitor in WITHOUT_MEMORY.items()}
 
 
 def _reads_on_odometer(

@@ -15,19 +15,27 @@ import schemas.errors
 from pipeline.stages.alignment.align import align
 from pipeline.stages.alignment.learning import learn
 from pipeline.stages.epochs.verdicts import failure_log, verdicts
+from pipeline.stages.judge.episodes import alarms_table, find_episodes
+from pipeline.stages.judge.epochs import judged_epochs, judged_offers, time_in_use
+from pipeline.stages.judge.failures import find_failures
+from pipeline.stages.judge.hazards import hazard_rows, hazards_table
+from pipeline.stages.judge.judge import crossings_of, judge, passages_table
+from pipeline.stages.judge.judgement import judge_positions
 from pipeline.stages.matching.match import find_path
+from pipeline.stages.monitored import monitor_solution
+from pipeline.stages.monitors.axes import axes_of
 from pipeline.stages.monitors.axis import along_series, run_axis
-from pipeline.stages.monitors.bank import axes_of
 from pipeline.stages.monitors.pseudorange import pseudorange_monitor
 from pipeline.stages.monitors.single import WITHOUT_MEMORY, channel_monitor, doppler_monitor
 from pipeline.stages.paths.growth import path_set
 from pipeline.stages.paths.path_steps import path_steps
 from pipeline.stages.prepare import prepare
+from pipeline.stages.run_row.lost_time import lost_columns, lost_time
+from pipeline.stages.run_row.run_figures import level_rows, reasons_of, verdict_of
+from pipeline.stages.run_row.summary import summarise
 from tests.docs.blocks import ROOT
 
 Function = Callable[..., Any]
-# Being made anew at the time of writing: to be taken out once its entry is described.
-WAITING = {"pipeline.stages.lds"}
 SECTIONS = ("Args", "Returns", "Raises", "Source")
 MONITORS = {"along_doppler": doppler_monitor, "channel": channel_monitor, "pseudorange": pseudorange_monitor}
 ENTRIES = (
@@ -42,6 +50,25 @@ ENTRIES = (
     path_set,
     path_steps,
     prepare,
+    monitor_solution,
+    judge,
+    judged_epochs,
+    judged_offers,
+    time_in_use,
+    judge_positions,
+    find_failures,
+    find_episodes,
+    alarms_table,
+    hazard_rows,
+    hazards_table,
+    crossings_of,
+    passages_table,
+    lost_columns,
+    lost_time,
+    reasons_of,
+    verdict_of,
+    level_rows,
+    summarise,
 )
 PACKAGES = sorted(".".join(path.parent.relative_to(ROOT).parts) for path in (ROOT / "pipeline").rglob("__init__.py"))
 # Every module of the schemas is for everyone; of the pipeline what its packages export.
@@ -49,7 +76,7 @@ SCHEMAS = sorted(f"schemas.{path.stem}" for path in (ROOT / "schemas").glob("*.p
 
 
 def exported() -> Iterator[Function]:
-    for name in sorted({*PACKAGES} - WAITING):
+    for name in PACKAGES:
         package = importlib.import_module(name)
         yield from (getattr(package, item) for item in getattr(package, "__all__", ()))
     for name in SCHEMAS:

@@ -15,6 +15,7 @@ from datasets.experiment.workers import generator
 from pipeline.stages.monitors.pseudorange import clock_columns, line_of_sight_rows, pseudorange_monitor
 from schemas.config import Configuration, MonitorConfig
 from schemas.stages import AlignedEpochs
+from tests.arrays_of_table import arrays_of_table
 from tests.experiment.counting import counted_alarms, counted_misses
 
 
@@ -61,7 +62,7 @@ def test_projection_equals_the_monitor_of_the_replay(constellation: Constellatio
             "used": True,
         }
     )
-    replayed = pseudorange_monitor(AlignedEpochs.of_table(epochs), satellites, Configuration())
+    replayed = pseudorange_monitor(arrays_of_table(AlignedEpochs, epochs), satellites, Configuration())
     value = one.project @ errors
     assert replayed.value[0] == pytest.approx(value @ value, rel=1e-9)
     assert replayed.threshold[0] == pytest.approx(one.threshold, rel=1e-12)

@@ -4,23 +4,19 @@ from __future__ import annotations
 
 import re
 from collections import Counter
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from datetime import date
 from itertools import pairwise
 from pathlib import Path
-from typing import Any
 
 import polars as pl
 
-from pipeline.make.receivers import nmea, novatel, sbf, ubx
 from pipeline.make.receivers.adding import BY_SOLUTION, Purpose, Streams, added, assigned
 from pipeline.make.receivers.bags import is_bag, read_bag
 from pipeline.make.receivers.csv import TABLES, names_file, read_csv
-from pipeline.make.receivers.epochs import Epochs, Gathered
-from pipeline.make.receivers.frames import Frame, Protocol, frames, name_of
 from pipeline.make.receivers.gpsd import is_gpsd, objects_in, read_gpsd
-from pipeline.make.receivers.rivals import sees_twins, two_receivers
+from pipeline.make.receivers.messages import NoEpochError, UnknownError, read_messages, reasons_text
 from pipeline.make.receivers.rtklib import is_solution, parts_of_solution, read_solution
 from pipeline.make.receivers.unpack import BAG_FOLDER, unpacked
 from pipeline.read.ingest.conform import conform, refuse
@@ -99,7 +95,7 @@ def as_run(
             place=run_id,
             found=", ".join(streams) or None,
             expected="GNSS positions, which a new run needs",
-            remedy="Convert the log of the receiver first or in the same call." + _reasons(logs.dropped),
+            remedy="Convert the log of the receiver first or in the same call." + reasons_text(logs.dropped),
         )
     held = logs.corrections_as(purpose or Purpose())
     notes = IngestNotes(damage=logs.damage, corrections=held)
@@ -167,8 +163,7 @@ class Gatherings:
     """The streams of all logs, as the contract has them, and what could not be used: reason to number.
 
     `corrections`: those that the streams hold already, of logs that are runs of this program; `damage`: what the logs
-    lack; `parts`: what they consist of, and what of it is used; `topics`: of
-    a bag, those that it holds.
+    lack; `parts`: what they consist of, and what of it is used; `topics`: of a bag, those that it holds.
     """
 
     streams: Streams
@@ -261,14 +256,6 @@ def _common(parts: list[tuple[Path, Gatherings]]) -> tuple[StreamCorrection, ...
     return tuple(correction for made in common.values() for correction in made)
 
 
-class NoEpochError(InputError):
-    """A log of a receiver whose messages tell no position with a time."""
-
-
-class UnknownError(InputError):
-    """A file without a message of a known receiver."""
-
-
 def said_of(reason: str) -> str:
     """What became of the records set apart for a reason: some are noted and used all the same.
 
@@ -279,11 +266,6 @@ def said_of(reason: str) -> str:
         `noted` or `not used`.
     """
     return "noted" if re.search(r"\((kept|put right)", reason) else "not used"
-
-
-def _reasons(dropped: Mapping[str, int]) -> str:
-    """What was not used, and why, for people."""
-    return "".join(f" Not used: {reason} ({count})." for reason, count in sorted(dropped.items()))
 
 
 def _concat_streams(parts: list[tuple[Path, Gatherings]]) -> Streams:
@@ -371,7 +353,8 @@ def _convert_one(log: Path, config: IngestConfig, date: date | None, solution: s
         streams, dropped = read_gpsd(content, log, solution)
         if streams["gnss"].height:
             return Gatherings(streams, dropped, parts=tuple(parts_of_messages(log.name, objects_in(content))))
-    return _read(content, log, date, solution)
+    found, left, parts = read_messages(content, log, date, solution)
+    return Gatherings(found, left, parts=parts)
 
 
 def of_topics(config: IngestConfig, log: Path | None = None) -> IngestConfig:
@@ -387,112 +370,3 @@ def of_topics(config: IngestConfig, log: Path | None = None) -> IngestConfig:
         if stream != "faults"
     }
     return config.model_copy(update=kept)
-
-
-def _read(
-    content: bytes, log: Path, date: date | None, solution: str | None, left_out: frozenset[str] = frozenset()
-) -> Gatherings:
-    """The epochs of the protocol that says most; what is damaged or said twice is counted. `left_out`: talkers."""
-    dropped: Counter[str] = Counter()
-    gathered = {protocol: Gathered() for protocol in _PROTOCOLS}
-    gathered[Protocol.NMEA] = nmea.Sentences(left_out=left_out)
-    named: Counter[tuple[Protocol, str, bool]] = Counter()
-    for frame in frames(content, lambda: dropped.update(["damaged message"]), lambda: dropped.update([_UNCHECKED])):
-        is_used = frame.protocol in gathered and _decode(frame, gathered[frame.protocol])
-        named[frame.protocol, name_of(frame), is_used] += 1
-    twins = {protocol: sees_twins(of) for protocol, of in gathered.items()}
-    ubx.settle_times(gathered[Protocol.UBX])
-    nmea.settle_days(gathered[Protocol.NMEA], date)
-    novatel.settle_source(gathered[Protocol.NOVATEL])
-    settled = {protocol: epochs.settled() for protocol, epochs in gathered.items()}
-    best = max(settled, key=lambda protocol: _worth(protocol, settled[protocol]))
-    for protocol, epochs in settled.items():
-        if protocol is best or not settled[best].positions:
-            dropped.update(gathered[protocol].dropped)
-        elif epochs.positions:
-            dropped[f"{protocol} position beside those of {best}"] += epochs.positions
-    if not settled[best].epochs:
-        raise _no_epoch(content, log, dropped)
-    rivals = gathered[best].rivals
-    if solution in rivals:
-        return _read(content, log, date, None, rivals - {solution})
-    if rivals or twins[best] is not None:
-        raise two_receivers(str(log), rivals, max(gathered[best].widest_m, twins[best] or 0.0))
-    counts = Counter({(name, used and protocol is best): 0 for protocol, name, used in named})
-    for (protocol, name, used), count in named.items():
-        counts[name, used and protocol is best] += count
-    return Gatherings(settled[best].streams(), dropped, parts=tuple(parts_of_messages(log.name, counts)))
-
-
-def _no_epoch(content: bytes, log: Path, dropped: Mapping[str, int]) -> InputError:
-    """What there is in place of positions tells what to change at the receiver."""
-    counts = Counter(name_of(frame) for frame in frames(content, lambda: None))
-    if not counts:
-        head = content[:_HEAD]
-        hint = next((hint for pattern, hint in _ALMOST.items() if re.search(pattern, head)), _OTHER)
-        return UnknownError(
-            "holds no message of a known receiver" if content else "is empty",
-            place=str(log),
-            expected="UBX, SBF, NMEA, NovAtel, JSON of gpsd, RTKLIB .pos, a bag, or CSV",
-            remedy=hint + _reasons(dropped),
-        )
-    return NoEpochError(
-        "no epoch with a time and a position",
-        place=str(log),
-        found=", ".join(f"{name} ({count})" for name, count in counts.most_common(_MOST_NAMES)),
-        expected="UBX NAV-PVT, SBF PVTGeodetic or PVTCartesian, NMEA GGA, GNS or RMC with a date, "
-        "NovAtel BESTPOS or INSPVA",
-        remedy="Let the receiver record one of these messages, or give the day of NMEA without one by --date."
-        + _reasons(dropped),
-    )
-
-
-def _worth(protocol: Protocol, epochs: Epochs) -> int:
-    """A receiver that sends NMEA beside its own protocol rounds there, and leaves out how accurate it is."""
-    return epochs.positions * (1 if protocol is Protocol.NMEA else 2)
-
-
-def _decode(frame: Frame, gathered: Gathered) -> bool:
-    """Add what a message says to its epoch; whether it is of a kind that is used."""
-    parse, decode = _PROTOCOLS[frame.protocol]
-    try:
-        message = parse(frame.content)
-    except ImportError as error:
-        raise InputError(
-            f"cannot be read without the package {error.name}",
-            place=f"{frame.protocol} messages",
-            remedy=f"Install the extra `{'novatel' if frame.protocol is Protocol.NOVATEL else 'receivers'}`.",
-        ) from None
-    except Exception:
-        # The parsers' own errors share no base class.
-        gathered.drop(_UNFIT)
-        return True
-    try:
-        if message is not None:
-            decode(gathered, message, frame.content)
-    except (AttributeError, OverflowError):  # a message that ends before its fields do, a time beyond all calendars
-        gathered.drop(_UNFIT)
-    return message is not None
-
-
-# What is left out though it is almost a log, and what to do.
-_OTHER = "Convert it to CSV and give a mapping, if the receiver is another one."
-_ALMOST = {
-    rb"\A.{20,60}C?RINEX VER": "RINEX holds ranges, no positions: compute them first, "
-    "for example with rnx2rtkp of RTKLIB, and convert the .pos file that it writes.",
-    rb"\$[A-Z]{2}(GGA|GNS|RMC),[^*\r\n]*\r?\n": "NMEA without checksums cannot be checked: let the logger keep them.",
-}
-_MOST_NAMES = 20
-# Where a hint is looked for: what begins with gigabytes of something else is no such file.
-_HEAD = 1024 * 1024
-_UNCHECKED = "sentence without a checksum (nothing shows whether it is whole)"
-_UNFIT = "message that does not fit its definition"
-
-
-# By protocol: what makes a message of a frame, and what adds it to its epoch. The first wins a tie.
-_PROTOCOLS: dict[Protocol, tuple[Callable[[bytes], Any], Callable[[Gathered, Any, bytes], None]]] = {
-    Protocol.UBX: (ubx.parse, ubx.decode),
-    Protocol.SBF: (sbf.parse, sbf.decode),
-    Protocol.NOVATEL: (novatel.parse, novatel.decode),
-    Protocol.NMEA: (nmea.parse, nmea.decode),
-}

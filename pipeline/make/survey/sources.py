@@ -8,7 +8,7 @@ import numpy as np
 import polars as pl
 
 from pipeline.make.receivers import as_run, gather
-from pipeline.make.receivers.convert import UnknownError
+from pipeline.make.receivers.messages import UnknownError
 from pipeline.make.survey.geojson_lines import read_geojson
 from pipeline.make.survey.map_files import MAP_SUFFIXES, read_map
 from pipeline.make.survey.pieces import Survey, content_of_survey, piece_of, with_own_names

@@ -58,7 +58,8 @@ def compare_tables(
     name = contract.__name__.lower()
     a, b = (rules.left(name, frame) for frame in (a, b))
     differences = [Difference(name, "schema", *what) for what in _schema_differences(a, b)]
-    common = [column for column in a.columns if b.schema.get(column) == a.schema[column]]
+    was, became = a.schema, b.schema  # each look at a schema makes the types of all columns anew
+    common = [column for column, dtype in was.items() if became.get(column) == dtype]
     if not set(keys) <= set(common):
         return differences
     if keys:
@@ -77,14 +78,15 @@ def compare_tables(
 
 def _schema_differences(a: pl.DataFrame, b: pl.DataFrame) -> Iterator[tuple[str, str]]:
     """Column, or none where it is about all of them, and what became of it."""
-    both = [column for column in a.columns if column in b.columns]
-    yield from ((column, "column is lost") for column in a.columns if column not in both)
-    yield from ((column, "column is new") for column in b.columns if column not in both)
-    if both != [column for column in b.columns if column in both]:
+    was, became = a.schema, b.schema
+    both = [column for column in was if column in became]
+    yield from ((column, "column is lost") for column in was if column not in became)
+    yield from ((column, "column is new") for column in became if column not in was)
+    if both != [column for column in became if column in was]:
         yield "", "columns stand in another order"
     for column in both:
-        if a.schema[column] != b.schema[column]:
-            yield column, f"{a.schema[column]} became {b.schema[column]}"
+        if was[column] != became[column]:
+            yield column, f"{was[column]} became {became[column]}"
 
 
 def _paired(

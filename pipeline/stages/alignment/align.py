@@ -11,7 +11,7 @@ from pipeline.stages.alignment.learning import Hold, ToLearn, learn
 from pipeline.stages.alignment.odometer_filter import Estimates, stamp_jitter_s
 from pipeline.stages.epochs.clock import periods_before_s
 from pipeline.stages.epochs.verdicts import NO_ODOMETER, NUMBER, first_reason
-from pipeline.stages.monitors.bank import along_axis
+from pipeline.stages.monitors.axes import along_axis
 from pipeline.stages.monitors.noise import NoiseMeter
 from pipeline.stages.odometry.driven import with_hysteresis
 from pipeline.stages.odometry.odometry import Odometry

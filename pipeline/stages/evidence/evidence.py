@@ -89,11 +89,12 @@ class TrainEvidence:
     """All evidence of a run.
 
     `off_track`: times with reference samples that lie on no track. `carried`: by each odometer from reads and the ends
-    of the reference, outside its time; `by_reads`: from reads alone, over the whole run. `stood`: times over which the
-    odometer carries nothing from one side. `stands`: ends of recordings at which the train stood; `parted`: an odometer
-    of unknown origin parts from an independent one; `doubted`: steps and drifts of the reference that an odometer or a
-    read contradicts, and clocks that change; `unsure`: times in which nobody knows which of the two failed; `disputes`:
-    times about reads that exclude the reference; `true_clocks_s`: by how much the odometer's stamps may be early.
+    of the reference, outside its time; `by_reads`: from reads alone, over the whole run. `standstills`: times over
+    which the odometer carries nothing from one side. `stands`: ends of recordings at which the train stood; `parted`:
+    an odometer of unknown origin parts from an independent one; `doubted`: steps and drifts of the reference that an
+    odometer or a read contradicts, and clocks that change; `unsure`: times in which nobody knows which of the two
+    failed; `disputes`: times about reads that exclude the reference; `true_clocks_s`: by how much the odometer's stamps
+    may be early.
     """
 
     stretches: tuple[KnownStretch, ...]
@@ -104,7 +105,7 @@ class TrainEvidence:
     clocks: tuple[RecorderClock, ...]
     network: Network
     config: Configuration
-    stood: tuple[Span, ...] = ()
+    standstills: tuple[Span, ...] = ()
     stands: tuple[Stand, ...] = ()
     parted: bool = False
     doubted: int = 0
@@ -168,8 +169,8 @@ class TrainEvidence:
     def at(self, t_ns: Ints) -> EvidenceSet:
         """Evidence at these instants of the GNSS's stamps, whichever of the clocks is the true one.
 
-        Nothing is carried from one side over a stand of the odometer (`stood`). Up to a second after a recording that
-        ended in a stand the train is taken to stand on.
+        Nothing is carried from one side over a stand of the odometer (`standstills`). Up to a second after a recording
+        that ended in a stand the train is taken to stand on.
 
         Args:
             t_ns: instants in any order [ns], shape (n,).
@@ -254,7 +255,7 @@ class TrainEvidence:
                 rows = rows[open_rows[rows]]
                 # A gap with one anchor is open at one side: nothing is carried beyond a standstill.
                 if len(gap.anchors) == 1:
-                    rows = rows[~_after_standing(instants.t_ns[rows], gap, self.stood)]
+                    rows = rows[~_after_standing(instants.t_ns[rows], gap, self.standstills)]
                 for route in gap.routes or [] if rows.size else []:
                     low_m, high_m = self._interval(source.counter, gap, route, t_ns[rows])
                     there = Alternative(rows, route.chain.route(self.network), low_m, high_m).where(np.isfinite(low_m))
@@ -425,10 +426,10 @@ def within_spans(t_ns: Ints, spans: Sequence[Span]) -> Bools:
     return inside
 
 
-def _after_standing(t_ns: Ints, gap: Gap, stood: Sequence[Span]) -> Bools:
+def _after_standing(t_ns: Ints, gap: Gap, standstills: Sequence[Span]) -> Bools:
     """Instants to which nothing can be carried, because the odometer stood still since the anchor."""
     void = np.zeros(t_ns.size, dtype=np.bool_)
-    for begin_ns, end_ns in stood:
+    for begin_ns, end_ns in standstills:
         if gap.begin is not None and end_ns > gap.begin_ns:
             void |= t_ns >= begin_ns
         if gap.end is not None and begin_ns < gap.end_ns:

@@ -71,7 +71,20 @@ class Episode(Extent):
 def find_episodes(
     history: ErrorHistory, failures: Sequence[Failure], log: FailureLog, faults: pl.DataFrame | None
 ) -> list[Episode]:
-    """One episode for each time that positions left the evidence, or offered a VB wrong."""
+    """One episode for each time that positions left the evidence, or offered a VB wrong.
+
+    Args:
+        history: the positions, judged, with their jumps and offers.
+        failures: of the same positions.
+        log: which monitor failed when.
+        faults: those injected (`t_start`, `t_end`, `target`), which name an onset better than positions can; or None.
+
+    Returns:
+        Episodes in order of time; none overlap.
+
+    Source:
+        DOMAIN section 5.3.
+    """
     episodes: list[Episode] = []
     floor = 0
     for mark in np.flatnonzero(history.judged.is_wrong | _offered_wrong(history)).tolist():
@@ -206,7 +219,21 @@ Healthy = dict[str, Bools]
 def alarms_table(
     name: str, epochs: JudgedEpochs, log: FailureLog, hazards: Sequence[Episode], config: Configuration
 ) -> pl.DataFrame:
-    """One row per alarm episode; `name`: of the solution, `epochs`: judged, `hazards`: the episode of each row."""
+    """One row per alarm episode, with its verdict and who is suspected.
+
+    Args:
+        name: of the solution.
+        epochs: its epochs as judged.
+        log: its alarms.
+        hazards: the episode of each row of hazards.
+        config: margins, look-back and Doppler gap.
+
+    Returns:
+        Rows of `schemas.tables.Alarms`.
+
+    Source:
+        DOMAIN section 5.3; CONTRACT section 3.
+    """
     healthy = healthy_across(epochs, config.hazards)
     rows = [
         {

@@ -72,12 +72,12 @@ def cross_errors(given: JudgeInput, heading_deg: Floats) -> Floats:
 class OdometerSteps:
     """From each epoch to the next: `counts`, the odometer has no gap there; `moves`, it shows movement.
 
-    `stood`: times [ns] in which it shows none while positions leave their place by more than the failure limit.
+    `standstills`: times [ns] in which it shows none while positions leave their place by more than the failure limit.
     """
 
     moves: Bools
     counts: Bools
-    stood: tuple[Span, ...] = ()
+    standstills: tuple[Span, ...] = ()
 
 
 def odometer_steps(given: JudgeInput) -> OdometerSteps:
@@ -90,13 +90,13 @@ def odometer_steps(given: JudgeInput) -> OdometerSteps:
     moves = _to_the_next(odometry.moved(at_ns), at_ns.size)
     counts = _to_the_next(np.isfinite(odometry.steps_m(at_ns)), at_ns.size)
     path_m = given.solution.epochs.path_m
-    stood: list[Span] = []
+    standstills: list[Span] = []
     for first, last in spans_of(counts & ~moves):
         rows = slice(first, min(last + 2, at_ns.size))
         places_m = path_m[rows][np.isfinite(path_m[rows])]
         if np.abs(places_m - places_m[:1]).max(initial=0.0) > given.config.hazards.limits.stand_m:
-            stood.append((int(at_ns[rows][0]), int(at_ns[rows][-1])))
-    return OdometerSteps(moves, counts, tuple(stood))
+            standstills.append((int(at_ns[rows][0]), int(at_ns[rows][-1])))
+    return OdometerSteps(moves, counts, tuple(standstills))
 
 
 def travel_direction(
@@ -127,24 +127,24 @@ def travel_direction(
 
 
 def moving(
-    at_ns: Ints, reference_m: Floats, half_m: Floats, steps: OdometerSteps, stood: Bools, config: Configuration
+    at_ns: Ints, reference_m: Floats, half_m: Floats, steps: OdometerSteps, standing: Bools, config: Configuration
 ) -> tuple[Bools, Bools]:
     """Per epoch whether the train moves to the next one, as is known, and whether it may.
 
     It may too where neither reference nor odometer knows.
 
-    By the reference (`reference_m` +- `half_m`) it does where its way over a second exceeds dead band and noise.
+    By the reference (`reference_m` +- `half_m`) it does where its movement over a second exceeds dead band and noise.
     """
     moved_m, noise_m, elapsed_s = _moved_m(at_ns, reference_m, half_m, config.align.speed_window_s)
     by_reference = np.abs(moved_m) > config.matching.deadband_mps * elapsed_s + noise_m
     moves = by_reference | (steps.moves & steps.counts)
-    sure = np.isfinite(moved_m) | (steps.counts & ~stood)
+    sure = np.isfinite(moved_m) | (steps.counts & ~standing)
     moves, sure = (_to_the_next(steps_of[:-1], at_ns.size) for steps_of in (moves, sure))
     return moves & sure, moves | ~sure
 
 
 def _moved_m(at_ns: Ints, place_m: Floats, half_m: Floats, window_s: float) -> tuple[Floats, Floats, Floats]:
-    """From each epoch to the one `window_s` later: the way [m], the half intervals of both places [m], the time [s]."""
+    """From each epoch to the one `window_s` later: the distance [m], both half intervals [m], the time [s]."""
     ahead = np.searchsorted(at_ns, at_ns + round(window_s * NS_PER_S)).clip(0, at_ns.size - 1)
     return place_m[ahead] - place_m, half_m + half_m[ahead], (at_ns[ahead] - at_ns) / NS_PER_S
 
@@ -209,7 +209,19 @@ class TimeInUse:
 
 
 def time_in_use(epochs: MonitoredEpochs, code: Ints, config: Configuration) -> TimeInUse:
-    """The time before each epoch that it accounts for; `code`: judgements, shape (epochs,)."""
+    """The time before each epoch that it accounts for.
+
+    Args:
+        epochs: of one solution, in order of time.
+        code: their judgements by number, shape (epochs,).
+        config: the configuration; used are `lds` and `hazards.reaction_s`.
+
+    Returns:
+        Whether each was in use, and its times [s].
+
+    Source:
+        DOMAIN section 5.3.
+    """
     known = epochs.positioned
     steps = _StepTimes.of(epochs, known, config)
     usable = epochs.trusted(config.lds) & ~epochs.withheld
@@ -300,7 +312,18 @@ def lds_states(negated: Bools, code: Ints, in_use: Bools, undiagnosed: Bools) ->
 
 
 def judged_epochs(given: JudgeInput, steps: OdometerSteps) -> JudgedEpochs:
-    """The epochs of the solution with evidence, judgement, direction, movement, time in use and state of the LDS."""
+    """The epochs of the solution with evidence, judgement, direction, movement, time in use and state of the LDS.
+
+    Args:
+        given: the solution and its evidence.
+        steps: what the odometer says of the steps between its epochs.
+
+    Returns:
+        The epochs in their order; errors in the direction of travel.
+
+    Source:
+        DOMAIN sections 5.2 and 5.3.
+    """
     epochs = given.solution.epochs
     config = given.config
     at_ns = given.instants_of_epochs()
@@ -312,14 +335,14 @@ def judged_epochs(given: JudgeInput, steps: OdometerSteps) -> JudgedEpochs:
     judged = along.turned(direction)
     train_m = positions.path_m - along.known_m(config.hazards.known_error_m)
     reference_m = np.where(along.kind == REFERENCE, train_m, np.nan)
-    stood = within_spans(at_ns, given.evidence.stood)
+    standing = within_spans(at_ns, given.evidence.standstills)
     accepted_ns = given.solution.crossings.t_ns[given.solution.crossings.accepted]
     odometer_wrong = beyond_confidence(epochs.t_ns, epochs.odometer_m, train_m, along.half_m, accepted_ns, config.lds)
     undiagnosed = epochs.diagnosis_faulty | odometer_wrong
     use = time_in_use(epochs, along.code, config)
     injected = under_injection(epochs.t_ns, given.faults, config.lds.recovery_s)
     error_cross_m, error_up_m = cross_errors(given, epochs.heading_deg)
-    moves, may_move = moving(at_ns, reference_m, along.half_m, steps, stood, config)
+    moves, may_move = moving(at_ns, reference_m, along.half_m, steps, standing, config)
     return JudgedEpochs(
         **epochs.columns()
         | {"direction": direction}
@@ -336,7 +359,7 @@ def judged_epochs(given: JudgeInput, steps: OdometerSteps) -> JudgedEpochs:
             "reference_m": reference_m,
             "moves": moves,
             "may_move": may_move,
-            "odometer_stood": stood,
+            "odometer_stood": standing,
             "odometer_wrong": odometer_wrong,
             "undiagnosed": undiagnosed,
             "natural_s": use.wrong_s * ~injected,
@@ -356,9 +379,19 @@ def direction_by_evidence(
 
 
 def judged_offers(given: JudgeInput, epochs: JudgedEpochs) -> JudgedOffers:
-    """The offers of the LDS, every telegram among them; `epochs`: judged.
+    """The offers of the LDS, every telegram among them.
 
     Judged is the place of the balise: at the time of the telegram, or of the crossing less the GNSS latency.
+
+    Args:
+        given: the solution and its evidence.
+        epochs: its epochs as judged.
+
+    Returns:
+        The offers in order of time.
+
+    Source:
+        DOMAIN section 5.2.
     """
     crossings = given.solution.crossings
     rows = given.solution.offers

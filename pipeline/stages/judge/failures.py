@@ -222,6 +222,15 @@ def find_failures(history: ErrorHistory) -> list[Failure]:
     """Wrong positions in use, in order of time.
 
     Two belong to one failure where less than `recovery_s` lies between them, or no settled position does.
+
+    Args:
+        history: the positions, judged.
+
+    Returns:
+        One for each time that positions were wrong in use.
+
+    Source:
+        DOMAIN section 5.3.
     """
     wrong = np.flatnonzero(history.positions.wrong_s > 0.0)
     if wrong.size == 0:

@@ -38,7 +38,18 @@ class HazardRow:
 
 
 def hazard_rows(episodes: Iterable[Episode], history: ErrorHistory) -> list[HazardRow]:
-    """At most one row per episode and class, and one for VBs that the jump back crosses; in order of time."""
+    """At most one row per episode and class, and one for VBs that the jump back crosses.
+
+    Args:
+        episodes: faults in order of time.
+        history: the positions and offers that they are of.
+
+    Returns:
+        Rows in order of time.
+
+    Source:
+        DIAG, VB Jump and VB Shift; DOMAIN section 5.3.
+    """
     return [row for episode in episodes for row in _of_episode(episode, history)]
 
 
@@ -47,8 +58,8 @@ def _of_episode(episode: Episode, history: ErrorHistory) -> list[HazardRow]:
     crossed = {hit for row in by_class.values() for hit in row.crossed}
     for hit in _hits(episode, history):
         if hit not in crossed:
-            astray = history.offers.judged.wrong_track[hit]
-            hazard = Hazard.VB_WRONG_TRACK if astray else min(by_class.keys() & _JUMPS, default=Hazard.VB_SHIFT)
+            on_other_track = history.offers.judged.wrong_track[hit]
+            hazard = Hazard.VB_WRONG_TRACK if on_other_track else min(by_class.keys() & _JUMPS, default=Hazard.VB_SHIFT)
             by_class.setdefault(hazard, HazardRow(hazard, episode)).hits.append(hit)
     rows = sorted(by_class.values(), key=lambda row: t_hazard_ns(row, history))
     back = episode.jump_back
@@ -81,10 +92,10 @@ def _hits(episode: Episode, history: ErrorHistory) -> list[int]:
 
 
 def crossed_by(jump: Jump, history: ErrorHistory) -> list[int]:
-    """Virtual balises on the way of a jump that the train's own step does not cross."""
+    """Virtual balises between the ends of a jump that the train's own step does not cross."""
     offers = history.offers
-    on_the_way = np.flatnonzero(offers.virtual & history.offers_between(jump.first, jump.last + 1))
-    if on_the_way.size == 0:
+    between = np.flatnonzero(offers.virtual & history.offers_between(jump.first, jump.last + 1))
+    if between.size == 0:
         return []
     positions = history.positions
     before, after = jump.first - 1, jump.last
@@ -94,7 +105,7 @@ def crossed_by(jump: Jump, history: ErrorHistory) -> list[int]:
     path_m = [float(positions.path_m[number]) for number in (before, after)]
     start_m = path_m[0] if np.isnan(train_m) else train_m
     low_m, high_m = sorted((start_m, start_m + (path_m[1] - path_m[0]) - step_m))
-    return [hit for hit in on_the_way.tolist() if not low_m <= offers.path_m[hit] <= high_m]
+    return [hit for hit in between.tolist() if not low_m <= offers.path_m[hit] <= high_m]
 
 
 def _class_of(crossed: list[int], offers: JudgedOffers) -> Hazard:
@@ -145,7 +156,17 @@ def rate_mps(row: HazardRow, history: ErrorHistory) -> float | None:
 def hazards_table(
     rows: Sequence[HazardRow], given: JudgeInput, epochs: JudgedEpochs, history: ErrorHistory
 ) -> pl.DataFrame:
-    """Rows in order of time; `hazard_id` is the place in `rows`; `epochs`: judged."""
+    """The hazards of a solution as a table.
+
+    Args:
+        rows: hazards in order of time; `hazard_id` is the place among them.
+        given: the solution.
+        epochs: its epochs as judged.
+        history: the positions and offers that the rows are of.
+
+    Returns:
+        Rows of `schemas.tables.Hazards`.
+    """
     ids = {id(row): number for number, row in enumerate(rows)}
     values = [
         {

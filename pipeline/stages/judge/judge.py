@@ -39,7 +39,7 @@ from schemas.stages import AlignedEpochs
 from schemas.tables import Passages
 
 # Numerics: so many instants before and after a track show where the train came from and went on to.
-_BESIDE = 100
+_NEIGHBOURS = 100
 
 
 class TrueCrossing(NamedTuple):
@@ -58,7 +58,14 @@ Crossings = dict[str, list[TrueCrossing]]
 
 
 def crossings_of(given: JudgeInput) -> Crossings:
-    """Crossings of each balise of the path by the train, in a direction in which the balise is valid."""
+    """Crossings of each balise of the path by the train, in a direction in which the balise is valid.
+
+    Args:
+        given: the balises of the path, and the evidence.
+
+    Returns:
+        Crossings of each balise in order of time.
+    """
     balises = given.solution.balises.unique("balise_id", keep="first")
     index = given.evidence.network.track.index
     elements = [index.get(name, -1) for name in balises["netelement_id"]]
@@ -66,7 +73,7 @@ def crossings_of(given: JudgeInput) -> Crossings:
     places = {name: Place(element, measure_m) for name, element, measure_m in spots}
     at_ns = between_far_epochs(given.instants_of_epochs(), given.config.align.speed_window_s)
     crossings = true_crossings(at_ns, given.evidence.at(at_ns), places, given.config)
-    # `valid_direction` is along the path, `sense` of a crossing along the measure; 0 is both ways.
+    # `valid_direction` is along the path, `sense` of a crossing along the measure; 0 is both directions.
     valid = dict(balises.select("balise_id", pl.col("valid_direction") * pl.col("sense")).iter_rows())
     return {
         name: [crossing for crossing in crossed if valid[name] in (0, crossing.sense)]
@@ -113,7 +120,7 @@ def true_crossings(t_ns: Ints, evidence: EvidenceSet, places: dict[str, Place], 
     for track in tracks:
         if track.rows.size == 0:
             continue
-        rows, at_m = _with_beside(track, train)
+        rows, at_m = _with_neighbours(track, train)
         on_track = np.isin(rows, track.rows)
         for balise, visit_m, sense in zip(*track.route.places(elements, measures_m), strict=True):
             if at_m.min() <= visit_m <= at_m.max():
@@ -123,16 +130,16 @@ def true_crossings(t_ns: Ints, evidence: EvidenceSet, places: dict[str, Place], 
     return {name: sorted(crossed) for name, crossed in crossings.items()}
 
 
-def _with_beside(track: Alternative, train: _Train) -> tuple[Ints, Floats]:
+def _with_neighbours(track: Alternative, train: _Train) -> tuple[Ints, Floats]:
     """Rows and coordinates on a track, also of the rows just before and after, where the train's place lies on it."""
     rows = track.rows
-    around = np.arange(max(rows[0] - _BESIDE, 0), min(rows[-1] + _BESIDE + 1, train.t_ns.size))
-    beside = np.setdiff1d(around, rows)
-    element = np.nan_to_num(train.element[beside], nan=-1).astype(np.int64)
-    near_m = track.middle_m[np.searchsorted(rows, beside).clip(0, rows.size - 1)]
-    there_m, _ = track.route.coordinate(element, train.measure_m[beside], near_m)
+    around = np.arange(max(rows[0] - _NEIGHBOURS, 0), min(rows[-1] + _NEIGHBOURS + 1, train.t_ns.size))
+    neighbours = np.setdiff1d(around, rows)
+    element = np.nan_to_num(train.element[neighbours], nan=-1).astype(np.int64)
+    near_m = track.middle_m[np.searchsorted(rows, neighbours).clip(0, rows.size - 1)]
+    there_m, _ = track.route.coordinate(element, train.measure_m[neighbours], near_m)
     known = np.isfinite(there_m)
-    both = np.concatenate([rows, beside[known]])
+    both = np.concatenate([rows, neighbours[known]])
     order = np.argsort(both, kind="stable")
     return both[order], np.concatenate([track.middle_m, there_m[known]])[order]
 
@@ -177,7 +184,18 @@ def passages_table(
 ) -> pl.DataFrame:
     """Passages of the LDS, and those of the train that it knows nothing of, with the columns of the evidence.
 
-    `undetected`: from each fault's onset to its detection.
+    Args:
+        given: the solution and its evidence.
+        epochs: its epochs as judged.
+        offers: its offers as judged; a passage finds its own by `crossing_id`.
+        rows: hazards, for the numbers of those that hit a passage.
+        undetected: spans from each fault's onset to its detection [ns].
+
+    Returns:
+        Rows of `schemas.tables.Passages`, in order of time.
+
+    Source:
+        CONTRACT section 3; SUBSET-026 3.4.4.
     """
     stamps = epochs.t_ns[epochs.positioned]
     crossings = crossings_of(given)
@@ -317,7 +335,7 @@ def _with_unoffered(passages: pl.DataFrame, given: JudgeInput, crossings: Crossi
         return passages
     times = np.array([crossing.t_ns for _, crossing in missed])
     positioned = _within_gap(stamps, times, given.config.lds).tolist()
-    rows = [_unoffered(*pair, given.solution.name, seen) for pair, seen in zip(missed, positioned, strict=True)]
+    rows = [_unoffered(*pair, given.solution.name, known) for pair, known in zip(missed, positioned, strict=True)]
     added = pl.DataFrame(rows, schema=passages.schema)
     when = pl.coalesce("t_offered", "t_reckoned")
     ordered = passages.with_columns(_when=when.forward_fill().backward_fill())
@@ -344,7 +362,7 @@ def _unoffered(balise: dict[str, Any], crossing: TrueCrossing, solution: str, po
 class Judged:
     """Tables by the contract, and the arrays that they were read from.
 
-    `distance_m`: way driven; `evidence`: what most epochs rest on.
+    `distance_m`: driven; `evidence`: what most epochs rest on.
     """
 
     hazards: pl.DataFrame
@@ -359,10 +377,20 @@ class Judged:
 
 
 def judge(given: JudgeInput) -> Judged:
-    """Judge one solution: epochs, offers, jumps, failures, episodes, then the rows."""
+    """Judge one solution: epochs, offers, jumps, failures, episodes, then the rows.
+
+    Args:
+        given: the solution as it was replayed, the evidence of its run, and its odometer.
+
+    Returns:
+        Hazards, alarms and passages as tables, and what was judged in arrays.
+
+    Source:
+        DOMAIN sections 5.2 to 5.5; DIAG, hazards.
+    """
     config = given.config
     steps = odometer_steps(given)
-    given = replace(given, evidence=replace(given.evidence, stood=steps.stood))
+    given = replace(given, evidence=replace(given.evidence, standstills=steps.standstills))
     epochs = judged_epochs(given, steps)
     offers = judged_offers(given, epochs)
     history = error_history_of(epochs, offers, given.odometry, config)

@@ -25,7 +25,7 @@ from schemas.stages import AlignedEpochs, Crossings
 
 @frozen
 class Solution:
-    """One solution: `fixes` as recorded, its epochs up to the LDS, what the LDS met, `balises` on its path."""
+    """One solution: `fixes` as recorded, its epochs up to the LDS, what the LDS passed, `balises` on its path."""
 
     name: str
     fixes: pl.DataFrame
@@ -45,7 +45,7 @@ class Solution:
 class JudgeInput:
     """One solution with the evidence of its run; `odometry` grows with its path, `faults` were injected.
 
-    `leaps_s`: whole leap seconds that may have to be added to the stamps of the positions, beside none; nobody knows.
+    `leaps_s`: whole leap seconds that may have to be added to the stamps of the positions, or none; nobody knows.
     """
 
     solution: Solution
@@ -125,10 +125,10 @@ def judgements_of(given: JudgeInput, positions: MatchedPositions, at_ns: Ints, e
         return judged
     crossings = given.solution.crossings
     accepted_ns = given.instants(crossings.t_ns[crossings.accepted])
-    stood = given.evidence.stood
+    standstills = given.evidence.standstills
     place_m = crossings.path_m[crossings.accepted]
     own = [
-        carried_forward(anchor_ns, place_m, clock_ns, given.odometry, stood, given.config)
+        carried_forward(anchor_ns, place_m, clock_ns, given.odometry, standstills, given.config)
         for anchor_ns, clock_ns in zip(given.clocks_ns(accepted_ns), given.clocks_ns(at_ns), strict=True)
     ]
     # NaN, where one of the clocks leaves nothing known.
@@ -144,8 +144,20 @@ def judge_positions(
 ) -> Judgements:
     """Wrong where it is too far ahead, or too far behind, for every alternative; right where it is right for all.
 
-    `legs`: of the path, coordinate `path_m`. The interval of the error spans the alternatives whose track joins the
-    position's, as only there a distance along the track exists.
+    The interval of the error spans the alternatives whose track joins the position's, as only there a distance along
+    the track exists.
+
+    Args:
+        positions: n positions on the network.
+        evidence: where the train was at the same n instants.
+        legs: the legs of the solution's path; their coordinate is `path_m`.
+        config: limits of an error [m].
+
+    Returns:
+        n judgements; errors along growing path.
+
+    Source:
+        DOMAIN section 5.2.
     """
     size = positions.element.size
     limit_m = config.limits.failure_m

@@ -178,7 +178,7 @@ def window_m(distance_m: float, accuracy_m: float, reference_accuracy_m: float, 
 
 
 def window_after_turn_m(distance_m: float, travelled_m: float, margin_m: float, config: LdsConfig = DEFAULTS) -> Window:
-    """Where the train turned round since the reference: 5 % of the whole way run, not of the net distance.
+    """Where the train turned round since the reference: 5 % of the whole distance run, not of the net distance.
 
     `margin_m` is Q + Q_r + 5 m. The clauses know no such case.
     """
@@ -224,8 +224,8 @@ class Crossing:
     """The position passes a virtual balise, or the reader reads a physical one.
 
     `before`, `epoch`: rows of the epochs around it. `sense`: of the position's step, +1 along growing path;
-    `direction`: of travel as known at `epoch`. Time, odometer and way are interpolated; after a gap they are those of
-    `epoch`, and `absence` says what a balise passed in it is.
+    `direction`: of travel as known at `epoch`. Time, odometer and distance are interpolated; after a gap they are those
+    of `epoch`, and `absence` says what a balise passed in it is.
     """
 
     balise: Balise
@@ -367,7 +367,7 @@ def in_order_of_time(crossings: Sequence[Crossing]) -> list[Crossing]:
 
 
 def arrays_of_crossings(crossings: Sequence[Crossing]) -> Crossings:
-    """What the LDS met, for later stages."""
+    """What the LDS passed, for later stages."""
     balises = [crossing.balise for crossing in crossings]
     return Crossings(
         balise_id=[balise.balise_id for balise in balises],

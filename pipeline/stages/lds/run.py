@@ -59,11 +59,22 @@ def run_lds(
     config: Configuration,
     solution: str = "primary",
 ) -> LdsResult:
-    """Detect virtual balises, keep the TVB chain, negate and return (DOMAIN section 4).
+    """Detect virtual balises, keep the TVB chain, negate and return.
 
-    `balises`: of the travelled path. `balise_reads`: `t, balise_id`, and
-    `odometer_m`; without that stream physical balises have no passages. `scale_sigma`: of the odometer by a vehicle
-    file, else None.
+    Args:
+        epochs: aligned epochs of the solution, in order of time.
+        bank: its monitors; the LDS freezes and restarts it.
+        balises: those of the travelled path, by leg, with path position, accuracy and linking.
+        balise_reads: telegrams (`t`, `balise_id`, `odometer_m` [m]); None: physical balises have no passages.
+        scale_sigma: deviation of the odometer's scale by a vehicle file [1], else None.
+        config: the configuration; used are `lds`, `align` and `monitors`.
+        solution: its name, as it stands in the passages.
+
+    Returns:
+        What the LDS says of each epoch, crossing and passage; at an epoch it knows nothing of later ones.
+
+    Source:
+        DOMAIN section 4; SUBSET-026 3.4.4 and 3.6.4; TVB section 3.
     """
     journey = Journey(epochs, scale_sigma, config)
     on_path = {kind: balises_of(balises, kind) for kind in BaliseKind}
@@ -147,8 +158,8 @@ def _reported_m(changes: list[LrvbChange], index: Ints, journey: Journey, config
     ]
     odometer_m, travelled_m, accuracy_m = np.array(values)[index].T
     distance_m = np.abs(journey.odometer_m - odometer_m)
-    way_m = np.maximum(np.abs(journey.travelled_m - travelled_m), distance_m)
-    return distance_m, accuracy_m + config.odometer_fixed_m + config.odometer_share * way_m
+    driven_m = np.maximum(np.abs(journey.travelled_m - travelled_m), distance_m)
+    return distance_m, accuracy_m + config.odometer_fixed_m + config.odometer_share * driven_m
 
 
 def _exposure_s(system: LocationSystem, journey: Journey) -> Floats:

@@ -119,10 +119,9 @@ def polarity_of_parts(network: Network, states: PathStates, counted_m: Floats) -
     """Sign of the odometer against each oriented element: +1, -1, or 0 where unknown.
 
     `counted_m`: per step of the states the distance since the step before, signed, NaN where unknown. The sign belongs
-    to
-    the installation and holds for the whole run, but the orientation of a connected part of the network is arbitrary:
-    so one sign for each part, by the votes of all states that stay on one element for a step. Of the path shown, which
-    looks back; the sign that the train counts with is `odometry.polarity`, by the first metres on that path.
+    to the installation and holds for the whole run, but the orientation of a connected part of the network is
+    arbitrary: so one sign for each part, by the votes of all states that stay on one element for a step. Of the path
+    shown, which looks back; the sign that the train counts with is `odometry.polarity`, by the first metres on it.
     """
     count = len(network.successors)
     if not network.orientable:

@@ -282,9 +282,9 @@ def travelled_route(match: Match) -> pl.DataFrame:
     """One row per net element in the order of growing path, leg by leg: the route, and what of it is in doubt.
 
     `doubtful`: the track was, at the time or in hindsight (the least probabilities of both stand next to it), or no
-    position tells of it. `rivals`: other elements possible
-    meanwhile, the most probable first, each with its highest probability, in words. `cross_bias_m`: by how much the
-    positions lie left of growing path there (median), which survey and antenna do and no GNSS fault.
+    position tells of it. `rivals`: other elements possible meanwhile, the most probable first, each with its highest
+    probability, in words. `cross_bias_m`: by how much the positions lie left of growing path there (median), which
+    survey and antenna do and no GNSS fault.
     """
     leg = match.epochs.leg
     rows = [

@@ -17,11 +17,13 @@ from pipeline.stages.odometry.rows import (
     StepDistances,
     contradicted_by_speeds,
     count_step,
+    declared_mps,
     declared_origin,
     filled_in,
+    slips_of,
     step_distances,
 )
-from schemas.arrays import NS_PER_S, Bools, Floats, Ints, floats, median, times_ns, truths
+from schemas.arrays import NS_PER_S, Bools, Floats, Ints, floats, median, times_ns
 from schemas.config import AlignConfig, Configuration, Vehicle
 from schemas.enums import Origin
 from schemas.frozen import frozen
@@ -345,7 +347,7 @@ def odometry_of(stream: pl.DataFrame | None, vehicle: Vehicle, config: Configura
     moved_m, counted, bridged_m = distances.moved_m, distances.counted, distances.bridged_m
     unknown = np.isnan(moved_m)
     pause = unknown | (dt_s > limit_s)
-    slip = _slips(stream, align)
+    slip = slips_of(stream, align)
     uncounted_pause = pause & ~counted
     lost = uncounted_pause | slip[1:]
     guessed = uncounted_pause & ~unknown
@@ -353,7 +355,7 @@ def odometry_of(stream: pl.DataFrame | None, vehicle: Vehicle, config: Configura
     moved_m = np.where(guessed, guess_m, moved_m)
     distance_m = _sums(np.where(unknown, 0.0, moved_m))
     whole = counted & ~lost & ~pause
-    noise, known_noise = noise_of_rows(t_s, distance_m, whole, counts, period_s, _declared_mps(stream), config)
+    noise, known_noise = noise_of_rows(t_s, distance_m, whole, counts, period_s, declared_mps(stream), config)
     parts = _contradicted(t_s, distance_m, distances, known_noise, config)
     doubt_m = _slip_doubt_m(np.diff(distance_m), dt_s, slip, floats(stream, "sigma_speed_mps"), align)
     doubt_m += np.where(guessed, guess_doubt_m, parts.doubt_m)
@@ -424,12 +426,6 @@ def _guessed_distances(
     )
 
 
-def _slips(stream: pl.DataFrame, config: AlignConfig) -> Bools:
-    """Whether a row is slip, by its flag or by a sigma of the speed beyond any use."""
-    slips: Bools = truths(stream["slip"]) | (floats(stream, "sigma_speed_mps") > config.slip_sigma_mps)
-    return slips
-
-
 def _slip_doubt_m(moved_m: Floats, dt_s: Floats, slip: Bools, sigma_mps: Floats, config: AlignConfig) -> Floats:
     """How much the count of each step into, in or out of slip may be off [m].
 
@@ -438,12 +434,6 @@ def _slip_doubt_m(moved_m: Floats, dt_s: Floats, slip: Bools, sigma_mps: Floats,
     sigma_mps = np.nan_to_num(np.fmax(sigma_mps[1:], sigma_mps[:-1]))
     doubt_m = np.maximum(np.maximum(config.slip_way_share * np.abs(moved_m), sigma_mps * dt_s), LEAST_DOUBT_M)
     return np.where(slip[1:] | slip[:-1], doubt_m, 0.0)
-
-
-def _declared_mps(stream: pl.DataFrame) -> Floats:
-    """The usual sigma of the speed as declared up to each row [m/s]; NaN where none is."""
-    declared = stream["sigma_speed_mps"].cast(pl.Float64)
-    return declared.rolling_median(_DECLARED_ROWS, min_samples=1).to_numpy()
 
 
 def _sums(steps: Floats) -> Floats:

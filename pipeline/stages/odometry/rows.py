@@ -8,7 +8,8 @@ import numpy as np
 import polars as pl
 
 from pipeline.stages.odometry.bound import OddRun, driven_within_m, odd_runs
-from schemas.arrays import Bools, Floats, Ints, spans_of
+from pipeline.stages.odometry.odometry import _DECLARED_ROWS
+from schemas.arrays import Bools, Floats, Ints, floats, spans_of, truths
 from schemas.config import AlignConfig, Vehicle
 from schemas.enums import Origin
 
@@ -324,3 +325,15 @@ def filled_in(
     order = np.argsort(at_s, kind="stable")
     source = np.concatenate([np.arange(t_s.size), rows[which]])[order]
     return at_s[order], np.concatenate([distance_m, distance_m[rows][which] + curve])[order], source
+
+
+def slips_of(stream: pl.DataFrame, config: AlignConfig) -> Bools:
+    """Whether a row is slip, by its flag or by a sigma of the speed beyond any use."""
+    slips: Bools = truths(stream["slip"]) | (floats(stream, "sigma_speed_mps") > config.slip_sigma_mps)
+    return slips
+
+
+def declared_mps(stream: pl.DataFrame) -> Floats:
+    """The usual sigma of the speed as declared up to each row [m/s]; NaN where none is."""
+    declared = stream["sigma_speed_mps"].cast(pl.Float64)
+    return declared.rolling_median(_DECLARED_ROWS, min_samples=1).to_numpy()

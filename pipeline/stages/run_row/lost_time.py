@@ -88,7 +88,18 @@ class LostColumns:
 
 
 def lost_columns(epochs: JudgedEpochs, config: Configuration) -> LostColumns:
-    """Lost to the first cause that applies. A gap is time without a position, as for `availability`."""
+    """Moving time by the first cause that applies. A gap is time without a position, as for `availability`.
+
+    Args:
+        epochs: of one solution, judged.
+        config: the configuration; used are `lds` and `align.gap_reset_s`.
+
+    Returns:
+        For each epoch the time to the next, and what it was lost to.
+
+    Source:
+        CONTRACT section 3, `lost_to`; LOC eq. 8.
+    """
     clock = Clock.at(epochs.t_ns, epochs.t_ns[np.isfinite(epochs.path_m)], config)
     steps_s = np.diff(clock.t_ns, append=clock.t_ns[-1:]) / NS_PER_S
     gap = clock.held_s < steps_s
@@ -100,7 +111,17 @@ def lost_columns(epochs: JudgedEpochs, config: Configuration) -> LostColumns:
 
 
 def lost_time(epochs: JudgedEpochs, lost: LostColumns, alarms: pl.DataFrame, config: Configuration) -> LostTime:
-    """Shares of the moving time."""
+    """Shares of the moving time.
+
+    Args:
+        epochs: of one solution, judged.
+        lost: what their time was lost to.
+        alarms: its rows of `Alarms`.
+        config: the configuration; used is `lds.recovery_s`.
+
+    Returns:
+        The share lost, its causes, and the monitor that failed most.
+    """
     whole_s = float(lost.moving_s.sum())
     if whole_s <= 0.0 or not epochs.moves[:-1].any():
         return LostTime()

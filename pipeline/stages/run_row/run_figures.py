@@ -65,9 +65,18 @@ _OF_LEVEL = {RunVerdict.UNSAFE: ThrVerdict.EXCEEDED, RunVerdict.UNPROVEN: ThrVer
 
 
 def reasons_of(run: RunRow, allowed_s: float, hazards: HazardConfig) -> list[Reason]:
-    """Why a run has its verdict, by the columns `DECISIVE` of its row (DOMAIN section 5.4).
+    """Why a run has its verdict.
 
-    `allowed_s`: allowed T_D; `hazards`: its limits.
+    Args:
+        run: its row, or the columns `DECISIVE` of it.
+        allowed_s: allowed T_D [s].
+        hazards: limits of the configuration.
+
+    Returns:
+        All reasons that apply, in the order of the enumeration.
+
+    Source:
+        DOMAIN section 5.4.
     """
     failures = failures_in(run)
     within, beyond = level_counts(failures, allowed_s)
@@ -91,7 +100,17 @@ def reasons_of(run: RunRow, allowed_s: float, hazards: HazardConfig) -> list[Rea
 
 
 def verdict_of(reasons: Iterable[Reason]) -> RunVerdict:
-    """The worst that applies; an assumed clock alone changes nothing (DOMAIN section 5.4)."""
+    """The worst that applies; an assumed clock alone changes nothing.
+
+    Args:
+        reasons: why a run is not safe.
+
+    Returns:
+        The verdict of the run.
+
+    Source:
+        DOMAIN section 5.4.
+    """
     against = set(reasons) - {Reason.CLOCK_ASSUMED}
     if against & _UNSAFE:
         return RunVerdict.UNSAFE
@@ -99,7 +118,18 @@ def verdict_of(reasons: Iterable[Reason]) -> RunVerdict:
 
 
 def level_rows(run: RunRow, config: Configuration) -> list[dict[str, object]]:
-    """One `runs` row against the allowed T_D of each service level, by the rules of the run's verdict."""
+    """One `runs` row against the allowed T_D of each service level, by the rules of the run's verdict.
+
+    Args:
+        run: the row by its columns.
+        config: the configuration; used are `safety` and `hazards`.
+
+    Returns:
+        By service level its allowed time [s], failures within and beyond it, and the verdict.
+
+    Source:
+        TVB eq. 7.
+    """
     failures = failures_in(run)
     in_time = ThrVerdict.KEPT if failures else ThrVerdict.NO_FAILURE
     rows: list[dict[str, object]] = []
@@ -166,15 +196,15 @@ def time_in_use(epochs: JudgedEpochs, recovery_s: float) -> Row:
     """
     used_s = epochs.used_s
     moves = epochs.may_move
-    seen = epochs.judgements.is_judged
+    judged_rows = epochs.judgements.is_judged
     negated_s = epochs.counted_s[epochs.negated]
     figures = {
         "in_use_s": float(used_s.sum()),
-        "in_use_judged_s": float(used_s[seen].sum()),
+        "in_use_judged_s": float(used_s[judged_rows].sum()),
         "negated_s": float(negated_s.sum()),
-        "share_unknown": share_of_time(used_s[moves], ~seen[moves]),
+        "share_unknown": share_of_time(used_s[moves], ~judged_rows[moves]),
         "share_undiagnosed": share_of_time(used_s[moves], epochs.undiagnosed[moves]),
-        "unknown_in_use_s": _longest_s(epochs.t_ns, used_s, ~seen & moves & (used_s > 0.0), recovery_s),
+        "unknown_in_use_s": _longest_s(epochs.t_ns, used_s, ~judged_rows & moves & (used_s > 0.0), recovery_s),
     }
     return figures if epochs.height else dict.fromkeys(figures)
 
@@ -324,16 +354,16 @@ def alarm_counts(alarms: pl.DataFrame, epochs: JudgedEpochs, evidence: enums.Evi
     """
     false = alarms.filter(pl.col("verdict") == enums.Verdict.FALSE).height
     monitored: Bools = np.logical_or.reduce([epochs.verdicts[f"along_{scale}"].evaluated for scale in SCALES])
-    seen = epochs.judgements.is_judged
+    judged_rows = epochs.judgements.is_judged
     counted_s = epochs.counted_s
-    judged_s = counted_s[monitored & seen & epochs.in_use]
+    judged_s = counted_s[monitored & judged_rows & epochs.in_use]
     times = {
         "held_s": counted_s,
         "monitored_s": counted_s[monitored],
-        "evidence_s": counted_s[seen],
+        "evidence_s": counted_s[judged_rows],
         "judged_s": judged_s,
     }
-    truth = evidence in TRUTH and bool(seen.any())
+    truth = evidence in TRUTH and bool(judged_rows.any())
     complete = truth and not (alarms["verdict"] == enums.Verdict.UNKNOWN).any()
     rate = poisson_rate(false, float(judged_s.sum()) / 3600.0) if complete else UNKNOWN
     return {

@@ -213,7 +213,19 @@ class SolutionResults:
 
 
 def summarise(results: SolutionResults, config: Configuration, provenance: Provenance) -> pl.DataFrame:
-    """One row of the `runs` table (CONTRACT section 3)."""
+    """One row of the `runs` table.
+
+    Args:
+        results: what the stages say of one solution.
+        config: the configuration; used are limits, service levels and advice.
+        provenance: digests and software.
+
+    Returns:
+        One row of `schemas.tables.Runs`.
+
+    Source:
+        CONTRACT section 3; DOMAIN section 5.4.
+    """
     epochs = results.judged.epochs
     clock = Clock.at(epochs.t_ns, epochs.t_ns[np.isfinite(epochs.path_m)], config)
     judged = results.judged

@@ -10,7 +10,8 @@ import polars as pl
 import pytest
 
 from pipeline.stages.epochs.verdicts import DISABLED, NO_ODOMETER, NO_POSITION, NO_VALUE, first_reason, verdicts
-from pipeline.stages.monitors.bank import FIRST_EPOCH, NO_HEIGHT, OFF_TRACK, MonitorBank
+from pipeline.stages.monitors.axes import NO_HEIGHT, OFF_TRACK
+from pipeline.stages.monitors.bank import FIRST_EPOCH, MonitorBank
 from pipeline.stages.monitors.single import NO_VELOCITY, channel_monitor, doppler_monitor, paired
 from schemas.config import Configuration, Vehicle, threshold_factor
 from schemas.stages import AlignedEpochs
