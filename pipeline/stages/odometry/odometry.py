@@ -28,9 +28,6 @@ from schemas.config import AlignConfig, Configuration, Vehicle
 from schemas.enums import Origin
 from schemas.frozen import frozen
 
-# Numerics: of so many rows the declared sigma is usual.
-_DECLARED_ROWS = 100
-
 
 class OdometerDistance(NamedTuple):
     """True distance between two instants, signed [m], and its variance [m^2]; NaN where it is not known.

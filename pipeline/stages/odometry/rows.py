@@ -8,7 +8,6 @@ import numpy as np
 import polars as pl
 
 from pipeline.stages.odometry.bound import OddRun, driven_within_m, odd_runs
-from pipeline.stages.odometry.odometry import _DECLARED_ROWS
 from schemas.arrays import Bools, Floats, Ints, floats, spans_of, truths
 from schemas.config import AlignConfig, Vehicle
 from schemas.enums import Origin
@@ -331,6 +330,10 @@ def slips_of(stream: pl.DataFrame, config: AlignConfig) -> Bools:
     """Whether a row is slip, by its flag or by a sigma of the speed beyond any use."""
     slips: Bools = truths(stream["slip"]) | (floats(stream, "sigma_speed_mps") > config.slip_sigma_mps)
     return slips
+
+
+# Numerics: of so many rows the declared sigma is usual.
+_DECLARED_ROWS = 100
 
 
 def declared_mps(stream: pl.DataFrame) -> Floats:
