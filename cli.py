@@ -698,16 +698,14 @@ def experiment(
     ] = None,
     seed: Annotated[int | None, Option(min=0, help="Seed of all random numbers; default: 1, or the plan's.")] = None,
     jobs: Jobs = 0,
-    config: Annotated[
-        Path | None, _file(help="Monitor bank to assess (`rare`, `bank`, `catalogue`, `recorded` only).")
-    ] = None,
+    config: Annotated[Path | None, _file(help="Monitor bank to assess (`rare`, `catalogue`, `recorded` only).")] = None,
     noise_of: Annotated[
         Path | None, _file(help="Result of fault-free runs whose noise replaces the published one (`rare` only).")
     ] = None,
     quiet: Quiet = False,
     as_json: Json = False,
 ) -> None:
-    """Repeat a published experiment, by default with its own number of runs, or on recorded runs (`recorded`)."""
+    """Repeat the published experiment, by default with its own number of runs, or on recorded runs (`recorded`)."""
     from datasets.experiment import EXPERIMENTS, RECORDED, experiment_of
 
     if name == "list":

@@ -69,6 +69,7 @@ def _log(segment: Path, name: str, columns: int) -> tuple[Floats, Floats]:
 
 
 def _array(path: Path, dimensions: int) -> Floats:
+    """An array of a segment, of so many dimensions."""
     try:
         values: Floats = np.load(path)
     except (OSError, ValueError) as error:
@@ -167,7 +168,7 @@ def _site(places: dict[str, Floats], balises_at_m: Sequence[float]) -> Site:
 
 
 def _poses_apart(places: dict[str, Floats]) -> list[int]:
-    """Each pose that lies a step from the one kept before: one that wanders at standstill adds nothing."""
+    """Poses a step from the one kept before: one that wanders at standstill adds nothing."""
     surface = points_of(places["latitude_deg"], places["longitude_deg"]).surface
     kept = [0]
     for row in range(1, len(surface)):

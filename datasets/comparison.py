@@ -1,4 +1,4 @@
-"""What was injected beside what a replay found."""
+"""What was injected against what a replay found."""
 
 from __future__ import annotations
 
@@ -32,11 +32,12 @@ class ComparisonRow:
 
     @property
     def agrees(self) -> bool:
+        """The replay found what was injected."""
         return self.expected == self.found
 
 
 def compare(spec: RunSpec, run: RunLog, tables: RunTables) -> list[ComparisonRow]:
-    """Each expectation of a run against its tables, its verdict first: hazards, onset, balises, alarms, scale."""
+    """Compare a run's expectations with its tables: verdict, hazards, onset, balises, alarms, scale."""
     if spec.expected is None:
         raise ConfigError("does not say what has to be found", place=f"scenario: run {spec.id}")
     injected = describe_faults(run.faults)
@@ -76,6 +77,7 @@ Pair = tuple[str, str, str]
 
 
 def _hazards(expected: ExpectedRun, found: pl.DataFrame) -> list[Pair]:
+    """Hazards expected, and those found."""
     rows = found.sort("hazard_id").to_dicts()
     pairs = [
         (
@@ -117,8 +119,8 @@ def _row_text(row: dict[str, object], expected: ExpectedHazard | None) -> str:
 
 def _words(hazard: object, mode: object, timing: object, hit: object, accepted: object, detected: object) -> str:
     lists = [" ".join(ids) or "-" if isinstance(ids, list | tuple) else "-" for ids in (hit, accepted)]
-    seen = "detected" if detected else "not detected"
-    return f"{hazard} {mode} {timing}: {lists[0]}, accepted despite the fault {lists[1]}, {seen}"
+    detection = "detected" if detected else "not detected"
+    return f"{hazard} {mode} {timing}: {lists[0]}, accepted despite the fault {lists[1]}, {detection}"
 
 
 def _onsets(spec: RunSpec, run: RunLog, found: pl.DataFrame) -> list[Pair]:
@@ -162,6 +164,7 @@ def _merged(pairs: list[Pair]) -> list[Pair]:
 
 
 def _alarms(expected: ExpectedRun, found: pl.DataFrame) -> list[Pair]:
+    """Alarms expected, and those found."""
     pairs = [("alarms", expected.alarms, _one_of(found["verdict"].to_list()))]
     if expected.suspect is not None:
         pairs.append(("suspect", expected.suspect, _one_of(found["suspect"].to_list())))
@@ -169,6 +172,7 @@ def _alarms(expected: ExpectedRun, found: pl.DataFrame) -> list[Pair]:
 
 
 def _scale(expected: ExpectedRun, found: pl.DataFrame) -> list[Pair]:
+    """Scale of the odometer expected, and that found."""
     if expected.odometer_scale is None:
         return []
     text = f"{expected.odometer_scale:g} ± {expected.odometer_scale_tolerance:g}"

@@ -49,6 +49,7 @@ class DemoResult:
 
     @property
     def agrees(self) -> bool:
+        """Every check of the demonstration holds."""
         return bool(self.checks["agrees"].all())
 
     @property
@@ -60,16 +61,16 @@ class DemoResult:
     def lines(self) -> pl.DataFrame:
         """One line per run, `run_id, injected, verdict, hazards, checks`, as short as a terminal is wide."""
         of_runs = self.checks.group_by("run_id", maintain_order=True)
-        told = of_runs.agg(pl.col("injected").first(), pl.col("agrees").sum(), pl.len()).rows()
+        agreement = of_runs.agg(pl.col("injected").first(), pl.col("agrees").sum(), pl.len()).rows()
         rows = [
             (run_id, _in_short(injected), _verdict(one), _classes(one.hazards), f"{agreeing}/{of}")
-            for (run_id, injected, agreeing, of), one in zip(told, self.tables, strict=True)
+            for (run_id, injected, agreeing, of), one in zip(agreement, self.tables, strict=True)
         ]
         names = ("run_id", "injected", "verdict", "hazards", "checks")
         return pl.DataFrame(rows, schema=dict.fromkeys(names, pl.String), orient="row")
 
     def as_dict(self) -> dict[str, object]:
-        """For programs; `checks` holds what was expected and found in full."""
+        """The demonstration for programs; `checks` holds what was expected and found in full."""
         verdicts = {"verdict": self.head.word, "verdicts": self.head.counts()}
         return {**verdicts, "page": self.page, "agrees": self.agrees, "checks": self.checks}
 
@@ -115,7 +116,7 @@ def demo(out: Path, seed: int | None = None, progress: Progress | None = None, j
 
 
 def _replay_trial(scenario: Scenario, out: Path, progress: Progress | None, jobs: int) -> None:
-    """As `balise run` would: the trial is a project, some of whose runs have no vehicle file."""
+    """Replay a trial as `balise run` would: as a project, some of whose runs have no vehicle file."""
     bare = {spec.id: NO_VEHICLE for spec in scenario.runs if not spec.vehicle}
     named = {"vehicle": "vehicle.toml", "vehicles": bare} if scenario.vehicle else {}
     project = {"site": "site", "out": "tables", **named, "replay": {"runs": ["runs/*"]}}
@@ -131,9 +132,11 @@ class _Replayed(CampaignWatch):
         self._progress = progress
 
     def counted(self, outcome: RunOutcome) -> None:
+        """Say that a run is done."""
         self._progress(f"{outcome.run_id}: replayed")
 
     def noted(self, text: str) -> None:
+        """Say a sentence."""
         self._progress(text)
 
 

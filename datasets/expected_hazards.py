@@ -41,34 +41,37 @@ def expected_hazards(scenario: Scenario, spec: RunSpec) -> tuple[ExpectedRow, ..
 
 @frozen
 class _World:
-    """Without noise, at the epochs: time [s], way run, error in the direction of travel, places of the VBs [m]."""
+    """Without noise, at the epochs: time [s], distance run, error in the direction of travel, places of the VBs [m]."""
 
     t_s: Floats
-    way_m: Floats
+    driven_m: Floats
     error_m: Floats
     names: tuple[str, ...]
     places_m: Floats
     margin_m: float
 
     def passed(self, a_m: float, b_m: float) -> frozenset[str]:
+        """Virtual balises between two places."""
         low = min(a_m, b_m)
         high = max(a_m, b_m)
         return frozenset(n for n, at in zip(self.names, self.places_m, strict=True) if low < at <= high)
 
     def near(self, at_m: float) -> bool:
+        """Whether a place is too near to a balise for noise to leave the answer certain."""
         return bool((np.abs(self.places_m - at_m) <= self.margin_m).any())
 
 
 def _world(scenario: Scenario, spec: RunSpec, fault: PlacedFault) -> _World:
+    """What of a scenario decides about hazards, without noise."""
     motion = build_motion(spec.motion)
     t_s = np.arange(0.0, motion.duration_s + 1e-9, 1.0 / spec.gnss.rate_hz)
     exact = placed(fault, motion, spec.gnss.rate_hz)
     error_m = offset_m(exact, t_s, np.random.default_rng(0))
-    way_m = motion.distance_m(t_s - spec.gnss.latency_s)
+    driven_m = motion.distance_m(t_s - spec.gnss.latency_s)
     names = tuple(balise.id for balise in scenario.line.balises)
     at_m = np.array([balise.at_m for balise in scenario.line.balises])
     places_m = (at_m - motion.start_m) * motion.sign
-    return _World(t_s, way_m, error_m, names, places_m, 6.0 * spec.gnss.sigma_east_m + 2.0)
+    return _World(t_s, driven_m, error_m, names, places_m, 6.0 * spec.gnss.sigma_east_m + 2.0)
 
 
 class _ExpectedRows:
@@ -96,19 +99,20 @@ class _ExpectedRows:
 
 
 def _class_of(ids: frozenset[str]) -> str:
+    """Class of a jump over so many balises."""
     return "VB_JUMP_1A" if len(ids) > 1 else "VB_JUMP_1B"
 
 
 def _look(world: _World, k: int, found: _ExpectedRows) -> bool:
     """Take the movement that leads to epoch `k`; false where it is too close to call."""
-    a_m = world.way_m[k - 1] + world.error_m[k - 1]
-    b_m = world.way_m[k] + world.error_m[k]
+    a_m = world.driven_m[k - 1] + world.error_m[k - 1]
+    b_m = world.driven_m[k] + world.error_m[k]
     step_m = world.error_m[k] - world.error_m[k - 1]
     t_s = float(world.t_s[k])
     if abs(step_m) > LIMIT_M:
-        if any(world.near(at_m) for at_m in (a_m, b_m, world.way_m[k - 1], world.way_m[k])):
+        if any(world.near(at_m) for at_m in (a_m, b_m, world.driven_m[k - 1], world.driven_m[k])):
             return False
-        ids = world.passed(a_m, b_m) - world.passed(a_m, a_m + world.way_m[k] - world.way_m[k - 1])
+        ids = world.passed(a_m, b_m) - world.passed(a_m, a_m + world.driven_m[k] - world.driven_m[k - 1])
         if ids:
             found.jumps.append((t_s, ids, abs(world.error_m[k]) < abs(world.error_m[k - 1])))
         return True
@@ -118,7 +122,7 @@ def _look(world: _World, k: int, found: _ExpectedRows) -> bool:
         return False
     if size_m > LIMIT_M:
         # A stand near a VB offers it again and again by noise alone.
-        if world.near(b_m) and world.way_m[k] == world.way_m[k - 1]:
+        if world.near(b_m) and world.driven_m[k] == world.driven_m[k - 1]:
             return False
         found.hits += [(t_s, name, float(world.error_m[k])) for name in sorted(offered)]
     return True

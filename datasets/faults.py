@@ -89,12 +89,14 @@ class FaultSpec(Settings):
     @model_validator(mode="before")
     @classmethod
     def _usual_target(cls, data: object) -> object:
+        """A fault without target has the usual one of its kind."""
         if isinstance(data, dict) and "target" not in data:
             return {**data, "target": _usual_target_of(str(data.get("kind")))}
         return data
 
     @model_validator(mode="after")
     def _says_how_much(self) -> Self:
+        """A fault has the one quantity that its kind needs."""
         needed = _NEEDS[self.kind]
         given = [name for name in _QUANTITIES if getattr(self, name) is not None]
         if given != ([needed] if needed else []):
@@ -109,13 +111,16 @@ class FaultSpec(Settings):
 
     @property
     def hits_ranges(self) -> bool:
+        """It is a fault of ranges: of a satellite, or of a group of them."""
         return self.target in _GROUPS or self.target[:1].isupper()
 
     @property
     def hits_odometer(self) -> bool:
+        """It is a fault of the odometer."""
         return self.target == "odometer"
 
     def begins_s(self) -> float:
+        """When it begins [s]."""
         return self.start_s or 0.0
 
 
@@ -127,6 +132,7 @@ class PlacedFault(FaultSpec):
 
     @model_validator(mode="after")
     def _begins_and_ends_once(self) -> Self:
+        """A fault has one begin, and at most one end."""
         if (self.at_m is None) == (self.start_s is None):
             raise ValueError("a fault needs either start_s or at_m")
         if self.until_m is not None and self.duration_s is not None:
@@ -193,7 +199,7 @@ def read_profile(path: str) -> tuple[Floats, Floats]:
 
 
 def active(fault: FaultSpec, t_s: Floats) -> Bools:
-    """From the start of the fault on, its end excluded."""
+    """Whether a fault is active, from its start on, its end excluded."""
     t_ns = np.round(t_s * NS_PER_S)
     begin_ns = round(fault.begins_s() * NS_PER_S)
     end_ns = np.inf if fault.duration_s is None else begin_ns + round(fault.duration_s * NS_PER_S)
@@ -280,12 +286,14 @@ def _size(fault: FaultSpec, to_end_s: float) -> float | None:
 
 
 def _usual_target_of(kind: str) -> str:
+    """What a kind of fault usually acts on."""
     if kind in (FaultKind.OUTAGE, FaultKind.LATENCY):
         return "position"
     return "odometer" if kind in _ON_ODOMETER else "along"
 
 
 def _allowed_targets(kind: FaultKind) -> tuple[str, ...]:
+    """What a kind of fault may act on."""
     if kind in _ON_ODOMETER:
         return ("odometer",)
     if kind is FaultKind.OUTAGE:

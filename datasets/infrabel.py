@@ -69,6 +69,7 @@ def infrabel_recording(log: Path) -> Converted:
 
 
 def _refuse_unreadable(texts: pl.DataFrame, values: pl.DataFrame, log: Path) -> None:
+    """Refuse texts that are no number."""
     for text, value in zip(texts, values, strict=True):
         wrong = value.is_null() & text.is_not_null() & (text != "")
         if wrong.any():

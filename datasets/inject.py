@@ -22,7 +22,7 @@ from datasets.faults import (
 )
 from datasets.inject_ranges import inject_ranges
 from datasets.line import RailPlaces, shifted
-from datasets.run_path import DrivenPath, displacement_m, driven_way
+from datasets.run_path import DrivenPath, displacement_m, driven_path
 from datasets.trial import write_run_as
 from pipeline.read.ingest import read_run
 from schemas.arrays import Floats
@@ -48,11 +48,11 @@ def load_faults(path: Path) -> tuple[FaultSpec, ...]:
     found = settings_from(read_toml(path), FaultFile, str(path), "docs/scenarios.md lists every key.").faults
     if not found:
         raise ConfigError("holds no fault", place=str(path), expected="[[faults]] tables")
-    return tuple(_with_profile_beside(fault, path.parent) for fault in found)
+    return tuple(_with_profile_path(fault, path.parent) for fault in found)
 
 
-def _with_profile_beside(fault: FaultSpec, folder: Path) -> FaultSpec:
-    """A profile is named as seen from its fault file."""
+def _with_profile_path(fault: FaultSpec, folder: Path) -> FaultSpec:
+    """A profile is named relative to its fault file."""
     return fault if fault.profile is None else fault.model_copy(update={"profile": str(folder / fault.profile)})
 
 
@@ -77,21 +77,21 @@ class Recording:
     def __init__(self, run: RunLog, site: Site | None = None) -> None:
         self._run = run
         self._site = site
-        self._ways: dict[str, DrivenPath] = {}
+        self._paths: dict[str, DrivenPath] = {}
         self.first_ns, self.last_ns = _span_ns(run)
 
-    def way(self, solution: str) -> DrivenPath:
-        """The way of this solution, found once."""
-        if solution not in self._ways:
-            self._ways[solution] = driven_way(self._run, solution, self._site)
-        return self._ways[solution]
+    def path_of(self, solution: str) -> DrivenPath:
+        """The path of this solution, found once."""
+        if solution not in self._paths:
+            self._paths[solution] = driven_path(self._run, solution, self._site)
+        return self._paths[solution]
 
 
 def inject(run: RunLog, fault: FaultSpec, site: Site | None = None, whole: Recording | None = None) -> RunLog:
     """The run with the fault added, and a `faults` stream that says so; `whole`: the recording that `run` is part of.
 
     Times count from the run's first GNSS epoch. Position faults keep the recorded noise: they are added to it.
-    Along and across the track follow the site where one is given, else the run's own way. Range faults need
+    Along and across the track follow the site where one is given, else the run's own path. Range faults need
     the `satellites` stream. Recorded velocities stay as they are. Random noise depends on run and fault alone.
     """
     whole = whole or Recording(run, site)
@@ -119,6 +119,7 @@ def inject(run: RunLog, fault: FaultSpec, site: Site | None = None, whole: Recor
 
 
 def _span_ns(run: RunLog) -> tuple[int, int]:
+    """First and last time of a run [ns]."""
     if run.gnss.is_empty():
         raise InputError("holds no epoch", place=f"{run.run_id}: gnss")
     t_ns = run.gnss["t"].to_physical()
@@ -131,6 +132,7 @@ def _seconds(frame: pl.DataFrame, first_ns: int) -> Floats:
 
 
 def _positions(run: RunLog, fault: FaultSpec, whole: Recording, rng: np.random.Generator) -> pl.DataFrame:
+    """Positions of a run with a fault."""
     parts = []
     for solution in run.gnss["solution"].unique(maintain_order=True):
         part = run.gnss.with_row_index("row").filter(pl.col("solution") == solution)
@@ -143,6 +145,7 @@ def _positions(run: RunLog, fault: FaultSpec, whole: Recording, rng: np.random.G
 def _position_fault(
     fault: FaultSpec, part: pl.DataFrame, solution: str, whole: Recording, rng: np.random.Generator
 ) -> pl.DataFrame:
+    """Positions of one solution with a fault."""
     t_s = _seconds(part, whole.first_ns)
     if fault.kind is FaultKind.OUTAGE:
         return part.filter(pl.Series(~active(fault, t_s)))
@@ -158,7 +161,7 @@ def _vectors(axis: str, solution: str, part: pl.DataFrame, size_m: Floats, whole
     if axis in ("along", "cross"):
         t_ns = part["t"].to_physical().to_numpy()
         ahead, left = (size_m, zeros) if axis == "along" else (zeros, size_m)
-        return displacement_m(whole.way(solution), t_ns, ahead, left)
+        return displacement_m(whole.path_of(solution), t_ns, ahead, left)
     return np.column_stack([size_m if axis == name else zeros for name in ("east", "north", "up")])
 
 
@@ -201,6 +204,7 @@ def _odometer(run: RunLog, fault: FaultSpec, first_ns: int) -> pl.DataFrame:
 
 
 def _faulty_sensor(odometer: pl.DataFrame, fault: FaultSpec, first_ns: int) -> pl.DataFrame:
+    """One sensor of the odometer with a fault."""
     t_s = _seconds(odometer, first_ns)
     if fault.kind is FaultKind.OUTAGE:
         return odometer.filter(pl.Series(~active(fault, t_s)))

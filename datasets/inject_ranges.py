@@ -35,6 +35,7 @@ class _RecordedRanges:
     used: Bools
 
     def solved(self, range_error_m: Floats, usable: Bools) -> PositionSolution:
+        """The position errors that errors of ranges make, (epochs, satellites)."""
         angles = (np.nan_to_num(self.azimuth_deg), np.nan_to_num(self.elevation_deg))
         return solve(self.svs, *angles, self.sigma_m, range_error_m, usable, self.recorded)
 
@@ -67,6 +68,7 @@ def inject_ranges(run: RunLog, fault: FaultSpec, first_ns: int, rng: np.random.G
 def _in_solution(
     fixes: pl.DataFrame, rows: pl.DataFrame, fault: FaultSpec, first_ns: int, rng: np.random.Generator
 ) -> tuple[pl.DataFrame, pl.DataFrame, bool]:
+    """Positions and residuals of one solution with a fault of satellites."""
     ranges = _arrays(rows)
     t_s = (ranges.t_ns - first_ns) / NS_PER_S
     hit = in_sector(fault, ranges.svs, ranges.azimuth_deg, ranges.elevation_deg) & ranges.recorded
@@ -93,6 +95,7 @@ def _profile(fault: FaultSpec, t_s: Floats, shape: tuple[int, ...], rng: np.rand
 
 
 def _arrays(rows: pl.DataFrame) -> _RecordedRanges:
+    """Residuals by epoch and satellite."""
     t_ns, epoch = np.unique(rows["t"].to_physical().to_numpy(), return_inverse=True)
     svs = sorted(rows["sv"].unique().to_list())
     satellite = np.searchsorted(svs, rows["sv"].to_list())
@@ -168,6 +171,7 @@ def _levels(
 
 
 def _rows_with(rows: pl.DataFrame, ranges: _RecordedRanges, residual_m: Floats, lost: Bools) -> pl.DataFrame:
+    """Rows of satellites with new residuals, without those lost."""
     epoch = np.searchsorted(ranges.t_ns, rows["t"].to_physical().to_numpy())
     satellite = np.searchsorted(ranges.svs, rows["sv"].to_list())
     new = pl.Series("residual_m", residual_m[epoch, satellite], nan_to_null=True)

@@ -43,6 +43,7 @@ class LineAxis:
 
     @property
     def length_m(self) -> float:
+        """Length of the line [m]."""
         return float(self.chainage_m[-1])
 
     def at(self, s_m: Floats) -> RailPlaces:
@@ -147,6 +148,7 @@ _PLACE = ("latitude_deg", "longitude_deg", "height_m")
 
 
 def _element_starts(spec: LineSpec) -> list[float]:
+    """Begin of each net element along the line [m]."""
     return [0.0, *accumulate(element.length_m for element in spec.elements[:-1])]
 
 
@@ -188,6 +190,7 @@ def _walk(spec: LineSpec, heading: Floats, slope_angle: Floats, step: float) -> 
 def _surveyed(
     line: LineAxis, element_id: str, begin_m: float, length_m: float, left_m: float, reverse: bool
 ) -> pl.DataFrame:
+    """A net element as it is surveyed."""
     points = int(np.ceil(length_m / line.spec.survey.spacing_m)) + 1
     measure = np.linspace(0.0, length_m, points)
     s_m = begin_m + (length_m - measure if reverse else measure)

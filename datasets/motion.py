@@ -58,6 +58,7 @@ class Motion:
 
     @property
     def duration_s(self) -> float:
+        """Length of the journey [s]."""
         return float(self.knots_s[-1])
 
     def distance_m(self, t_s: Floats) -> Floats:
@@ -75,6 +76,7 @@ class Motion:
         return speed
 
     def chainage_m(self, t_s: Floats) -> Floats:
+        """Chainage at these times [m]."""
         return self.start_m + self.sign * self.distance_m(t_s)
 
     def time_at(self, s_m: float) -> float:
@@ -121,6 +123,7 @@ class _MotionPieces:
         self.rows: list[tuple[float, float, float, float]] = []
 
     def add(self, duration_s: float, acceleration: float) -> None:
+        """Go on at constant acceleration for a time."""
         if duration_s <= 0.0:
             return
         self.rows.append((self.time, self.distance, self.speed, acceleration))
@@ -129,6 +132,7 @@ class _MotionPieces:
         self.time += duration_s
 
     def reach(self, speed: float, acceleration: float) -> None:
+        """Accelerate or brake up to a speed."""
         change = speed - self.speed
         self.add(abs(change) / acceleration, float(np.copysign(acceleration, change)))
         self.speed = speed
@@ -148,6 +152,7 @@ class _MotionPieces:
         self.reach(0.0, deceleration)
 
     def motion(self) -> Motion:
+        """The whole journey."""
         rows = [*self.rows, (self.time, self.distance, self.speed, 0.0)]
         columns = np.array(rows, dtype=np.float64).T
         return Motion(self.start_m, self.sign, *columns)

@@ -54,6 +54,7 @@ def sample_times_ns(duration_s: float, rate_hz: float) -> npt.NDArray[np.int64]:
 def _speed(
     spec: OdometerSpec, motion: Motion, faults: Sequence[FaultSpec], t_s: Floats, rng: np.random.Generator
 ) -> Floats:
+    """Speed that the odometer reports [m/s]."""
     true = motion.speed_mps(t_s)
     noise = np.where(true != 0.0, spec.speed_sigma_mps * rng.standard_normal(t_s.size), 0.0)
     return odometer_speeds(faults, t_s, true / spec.scale) + noise

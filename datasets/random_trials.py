@@ -53,6 +53,7 @@ def random_trial(seed: int) -> RandomTrial:
 
 
 def _scenario(seed: int, rng: np.random.Generator, kind: str) -> Scenario:
+    """A scenario drawn by a seed."""
     sigma_m = float(rng.choice([0.5, 1.0, 1.5]))
     scale = float(rng.choice([1.0, 1.003, 0.996]))
     latency_s = float(rng.choice([0.0, 0.08]))
@@ -103,6 +104,7 @@ def _scenario(seed: int, rng: np.random.Generator, kind: str) -> Scenario:
 
 
 def _motion(rng: np.random.Generator, forward: bool) -> dict[str, Any]:
+    """A motion drawn at random."""
     phases: list[dict[str, Any]] = [
         {"speed_mps": float(rng.uniform(20.0, 30.0)), "hold_s": float(rng.uniform(60.0, 100.0))}
         for _ in range(int(rng.integers(2, 4)))

@@ -51,9 +51,9 @@ class TrainOnLine:
         """Antenna places; `ahead_m` follows the track towards the leading end, `left_m` is left of that end."""
         lever_m = self.vehicle.gnss_antenna_ahead_m + ahead_m
         rail = self.line.at(self.motion.chainage_m(t_s) + self.motion.sign * lever_m)
-        beside = offset_places(rail, self.motion.sign * left_m)
+        over_ground = offset_places(rail, self.motion.sign * left_m)
         zeros = np.zeros(t_s.size)
-        return shifted(beside, zeros, zeros, zeros + self.vehicle.antenna_height_m)
+        return shifted(over_ground, zeros, zeros, zeros + self.vehicle.antenna_height_m)
 
 
 def gnss_streams(
@@ -74,6 +74,7 @@ def gnss_streams(
 
 
 def _without_sky(spec: GnssSpec, epochs: int, rng: np.random.Generator) -> ObservedSky:
+    """Position errors without satellites."""
     sigmas = (spec.sigma_east_m, spec.sigma_north_m, spec.sigma_up_m)
     covariance = np.broadcast_to(np.diag(np.square(sigmas)), (epochs, 3, 3))
     satellites = None if spec.satellites is None else np.full(epochs, spec.satellites)
@@ -94,6 +95,7 @@ def _solution_table(
     rng: np.random.Generator,
     velocity_rng: np.random.Generator,
 ) -> pl.DataFrame:
+    """Positions of one solution."""
     t_s = t_ns / NS_PER_S
     own = [fault for fault in faults if fault.solution in (None, observed.solution)]
     effect = position_effect(own, t_s, rng)
@@ -143,6 +145,7 @@ def true_velocity(journey: TrainOnLine, t_s: Floats) -> Floats:
 
 
 def _velocity(spec: GnssSpec, journey: TrainOnLine, t_s: Floats, rng: np.random.Generator) -> Floats | None:
+    """Velocities that a receiver reports, if it does."""
     noise = spec.velocity_sigma_mps * rng.standard_normal((t_s.size, 3))
     return true_velocity(journey, t_s) + noise if spec.velocity else None
 

@@ -34,14 +34,14 @@ class Conversion:
     parts: Sequence[LogPart] = ()
 
     def lines(self) -> list[str]:
-        """For people."""
+        """The result for people."""
         unused = [f"{said_of(reason)}: {count} x {visible(reason)}" for reason, count in self.not_used.items()]
         made = [f"corrected: {visible(text)}" for text in self.corrected]
         listed = map(visible, [*lines_of_parts(self.parts), *drafts_of(self.parts)])
         return [f"{self.epochs} epochs in {self.run}", *unused, *made, *listed, *self.fit.lines()]
 
     def as_dict(self) -> dict[str, object]:
-        """For programs."""
+        """The result for programs."""
         head = {"run": self.run, "epochs": self.epochs, "not_used": self.not_used, "corrected": self.corrected}
         return {**head, "parts": [vars(part) for part in self.parts], **self.fit.as_dict()}
 

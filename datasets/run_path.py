@@ -1,4 +1,4 @@
-"""The way a recorded train went, so that a displaced position stays on its track."""
+"""The path that a recorded train took, so that a displaced position stays on its track."""
 
 from __future__ import annotations
 
@@ -13,14 +13,14 @@ from schemas.errors import InputError
 from schemas.frozen import frozen
 from schemas.run import RunLog, Site
 
-# Positions are averaged over this much way, and movement below it is taken for noise of a standing train.
+# Positions are averaged over this distance, and movement below it is taken for noise of a standing train.
 _BIN_M = 10.0
 _OUTER_CELLS = 3
 
 
 @frozen
 class DrivenPath:
-    """Where positions were along their own way and left of it at some instants, and the way by the distance along it.
+    """Where positions were along their own path and left of it at some instants, and the path by the distance along it.
 
     `own_height_m`: of the positions. `course_m`: over so much of it, to both sides, its course is taken.
     """
@@ -36,52 +36,52 @@ class DrivenPath:
     height_m: Floats
 
     def places(self, s_m: Floats) -> tuple[Floats, Floats, Floats]:
-        """Positions at distances along the way; beyond its ends it goes on straight."""
+        """Positions at distances along the path; beyond its ends it goes on straight."""
         axes = (self.latitude_deg, self.longitude_deg, self.height_m)
         latitude, longitude, height = (_interpolated(s_m, self.axis_m, values) for values in axes)
         return latitude, longitude, height
 
 
-def driven_way(run: RunLog, solution: str, site: Site | None = None) -> DrivenPath:
+def driven_path(run: RunLog, solution: str, site: Site | None = None) -> DrivenPath:
     """The track of the site where one is given, else what the run's own positions show, averaged over 10 m."""
-    return _own_way(run, solution) if site is None else _site_way(run, solution, site)
+    return _own_path(run, solution) if site is None else _site_path(run, solution, site)
 
 
-def displacement_m(way: DrivenPath, t_ns: Ints, ahead_m: Floats, left_m: Floats) -> Floats:
+def displacement_m(driven: DrivenPath, t_ns: Ints, ahead_m: Floats, left_m: Floats) -> Floats:
     """East, north, up [m] of positions moved along the track and to its left, shape (instants, 3).
 
     Ahead is the run's first direction of travel.
     """
     now = t_ns.astype(np.float64)
-    known = way.t_ns.astype(np.float64)
-    s_m, beside_m, own_m = (np.interp(now, known, at) for at in (way.s_m, way.left_m, way.own_height_m))
-    here = way.places(s_m)
-    there = way.places(s_m + ahead_m)
-    east_here, north_here = _left_of(way, s_m)
-    # A position beside the track stays as far beside it where the track has turned.
-    begin = moved_deg(*here, beside_m * east_here, beside_m * north_here)
-    east_there, north_there = _left_of(way, s_m + ahead_m)
-    end = moved_deg(*there, beside_m * east_there, beside_m * north_there)
+    known = driven.t_ns.astype(np.float64)
+    s_m, offset_m, own_m = (np.interp(now, known, at) for at in (driven.s_m, driven.left_m, driven.own_height_m))
+    here = driven.places(s_m)
+    there = driven.places(s_m + ahead_m)
+    east_here, north_here = _left_of(driven, s_m)
+    # A position off the track stays as far off it where the track has turned.
+    begin = moved_deg(*here, offset_m * east_here, offset_m * north_here)
+    east_there, north_there = _left_of(driven, s_m + ahead_m)
+    end = moved_deg(*there, offset_m * east_there, offset_m * north_there)
     east, north, _ = _local_m((*begin, own_m), (*end, own_m))
     return np.column_stack([east + left_m * east_here, north + left_m * north_here, there[2] - here[2]])
 
 
-def _left_of(way: DrivenPath, s_m: Floats) -> tuple[Floats, Floats]:
-    """East and north of the unit vector to the left of the way at these distances."""
-    course_e, course_n, _ = _local_m(way.places(s_m - way.course_m), way.places(s_m + way.course_m))
+def _left_of(driven: DrivenPath, s_m: Floats) -> tuple[Floats, Floats]:
+    """East and north of the unit vector to the left of the path at these distances."""
+    course_e, course_n, _ = _local_m(driven.places(s_m - driven.course_m), driven.places(s_m + driven.course_m))
     norm = np.hypot(course_e, course_n)
     return -course_n / norm, course_e / norm
 
 
-def _own_way(run: RunLog, solution: str) -> DrivenPath:
-    """From the run's own positions, by odometer distance where recorded, else by the way the positions make."""
+def _own_path(run: RunLog, solution: str) -> DrivenPath:
+    """The path of the run's own positions, by odometer distance where recorded, else by that between positions."""
     fixes = _fixes(run, solution)
     t_ns = fixes["t"].to_physical().to_numpy()
     places = [fixes[name].to_numpy().astype(np.float64) for name in ("latitude_deg", "longitude_deg", "height_m")]
     places[2] = np.nan_to_num(places[2])
     s_m = _odometer_m(run, t_ns)
     if s_m is None:
-        s_m = _way_of_positions_m(*places)
+        s_m = _distance_of_positions_m(*places)
     cell = np.floor(s_m / _BIN_M).astype(np.int64)
     cells, of_epoch = np.unique(cell, return_inverse=True)
     if cells.size < 3:
@@ -91,8 +91,8 @@ def _own_way(run: RunLog, solution: str) -> DrivenPath:
     return DrivenPath(t_ns, s_m, np.zeros_like(s_m), places[2], _BIN_M, *means)
 
 
-def _site_way(run: RunLog, solution: str, site: Site) -> DrivenPath:
-    """From the site: every epoch of the run, and what lies beyond, at its place on the matched path."""
+def _site_path(run: RunLog, solution: str, site: Site) -> DrivenPath:
+    """The path by the site: every epoch of the run, and what lies beyond, at its place on the matched path."""
     prepared = prepare(run, site, Vehicle(), Configuration())
     fixes = prepared.fixes(solution)
     found = prepared.match(solution)
@@ -118,6 +118,7 @@ _BEYOND_M = 5000.0
 
 
 def _on_track(track: pl.DataFrame, elements: list[str | None], measures: Floats) -> tuple[Floats, Floats, Floats]:
+    """Places on the track, by net element and measure."""
     names = np.array(elements, dtype=object)
     result = np.full((3, names.size), np.nan)
     for element in dict.fromkeys(elements):
@@ -131,6 +132,7 @@ def _on_track(track: pl.DataFrame, elements: list[str | None], measures: Floats)
 
 
 def _fixes(run: RunLog, solution: str) -> pl.DataFrame:
+    """Positions of one solution, those without fix left out."""
     fixes = run.gnss.filter(
         (pl.col("solution") == solution) & pl.col("latitude_deg").is_not_null() & (pl.col("fix") != "none")
     )
@@ -155,7 +157,7 @@ def _odometer_m(run: RunLog, t_ns: Ints) -> Floats | None:
     return along
 
 
-def _way_of_positions_m(latitude_deg: Floats, longitude_deg: Floats, height_m: Floats) -> Floats:
+def _distance_of_positions_m(latitude_deg: Floats, longitude_deg: Floats, height_m: Floats) -> Floats:
     """Length of the polyline through positions at least 10 m apart; those between are placed by share of time."""
     kept = [0]
     for i in range(1, latitude_deg.size):

@@ -52,7 +52,7 @@ class ElementSpec(Settings):
 
 
 class ParallelSpec(Settings):
-    """A second track beside the line, `left_m` to its left (negative: right), linked to nothing."""
+    """A second track parallel to the line, `left_m` to its left (negative: right), linked to nothing."""
 
     id: Identity
     from_m: NonNegative
@@ -225,6 +225,7 @@ _COMMON = ("gnss", "odometer", "reference")
 
 
 def _with_defaults(run: object, common: Mapping[str, object]) -> object:
+    """A run with what is common to all."""
     if not isinstance(run, Mapping):
         return run
     merged = dict(run)
@@ -238,6 +239,7 @@ def _with_defaults(run: object, common: Mapping[str, object]) -> object:
 
 
 def _refuse_repeats(place: str, names: list[str]) -> None:
+    """Refuse names that occur twice."""
     repeated = sorted({name for name in names if names.count(name) > 1})
     if repeated:
         raise ValueError(f"{place}: names repeated: {', '.join(repeated)}")

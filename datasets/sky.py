@@ -108,6 +108,7 @@ def track_satellites(
 
 
 def _observed(spec: SkySpec, name: str, solution: PositionSolution) -> ObservedSky:
+    """Errors and protection levels as the receiver has them."""
     levels = protection_levels(solution.covariance_m2)
     horizontal = levels.hpl_pa_m if spec.protection == "pa" else levels.hpl_npa_m
     count = solution.used.sum(axis=1)
@@ -116,6 +117,7 @@ def _observed(spec: SkySpec, name: str, solution: PositionSolution) -> ObservedS
 
 
 def _satellites_table(name: str, t_ns: Ints, ranges: SimulatedRanges, solution: PositionSolution) -> pl.DataFrame:
+    """Residuals of the satellites tracked."""
     epoch, satellite = np.nonzero(ranges.tracked & np.isfinite(solution.residual_m))
     svs = np.array(ranges.svs)
     table = pl.DataFrame(

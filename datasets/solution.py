@@ -99,9 +99,9 @@ def solve(
         design = design_rows(names, azimuth_deg[used], elevation_deg[used])
         variance, gain = least_squares(design, sigma_m[used])
         state = np.einsum("tij,tj->ti", gain, range_error_m[used])
-        seen = shown[[svs[int(i)][:1] in systems for i in shown]]
-        cells = np.ix_(rows, seen)
-        all_rows = design_rows([svs[int(i)] for i in seen], azimuth_deg[cells], elevation_deg[cells])
+        tracked = shown[[svs[int(i)][:1] in systems for i in shown]]
+        cells = np.ix_(rows, tracked)
+        all_rows = design_rows([svs[int(i)] for i in tracked], azimuth_deg[cells], elevation_deg[cells])
         residual[cells] = range_error_m[cells] - np.einsum("tij,tj->ti", all_rows, state)
         error[rows] = state[:, :3]
         covariance[rows] = variance[:, :3, :3]

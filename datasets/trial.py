@@ -123,6 +123,7 @@ def write_run_as(run: RunLog, path: Path, log: LogKind | None = None) -> None:
 
 
 def _stream_bytes(name: Stream, run: RunLog, run_id: str) -> bytes | None:
+    """A stream as a Parquet file."""
     stream = run.stream(name)
     if stream is None:
         return None

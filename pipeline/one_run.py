@@ -19,57 +19,82 @@ from pipeline.studies.plausibility.fit import Fit, clock_advice, required_fit, w
 from pipeline.studies.plausibility.report import accuracy_checks, refuted
 from pipeline.studies.undetected.columns import Undetected, unnoticed_of
 from schemas.config import Configuration, Vehicle
-from schemas.conform import conform
+from schemas.conform import shaped
 from schemas.enums import Reason
 from schemas.errors import InputError
 from schemas.run import RunLog, RunTables, Site
-from schemas.stages import EpochFigures
 from schemas.tables import TABLES
 
 Tables = dict[str, pl.DataFrame]
 """Those of one solution, by name."""
 Matches = dict[str, Match]
 """By solution: the one that is replayed, and the one, if any, that the channel monitor compares with it."""
+Channel = dict[str, tuple[Fit, Match]]
+"""The solution that the channel monitor compares with; empty without one."""
 
 
 def replay(run: RunLog, site: Site, vehicle: Vehicle | None = None, config: Configuration | None = None) -> RunTables:
     """Replay one recorded run: match, align, monitor, detect balises, judge, summarise.
 
-    `run` as `read_run` yields it, `site` as `read_site` does. A solution that cannot be replayed has a failed row and
-    leaves the others alone; raises `InputError` where none can be.
+    Args:
+        run: the run as `read_run` yields it.
+        site: the site as `read_site` yields it.
+        vehicle: antenna places [m], odometer scale [1] and latencies [s], as far as known; None: nothing is.
+        config: the configuration; None: the defaults.
+
+    Returns:
+        The five tables of the run; a solution that cannot be replayed has a failed row in `runs` and no other.
+
+    Raises:
+        InputError: no solution can be replayed.
+
+    Source:
+        DOMAIN sections 2 to 5; CONTRACT section 3.
     """
     prepared = prepare(run, site, vehicle or Vehicle(), config or Configuration(), clock_advice)
     evidence = prepared.evidence()
-    channel_match = _compared_with(prepared)
+    channel = _compared_with(prepared)
     errors: list[InputError] = []
     parts: list[Tables] = []
     # A solution at a time: of those done only the tables are kept.
     for solution in prepared.run.solutions():
         try:
-            parts.append(_of_solution(prepared, solution, channel_match, evidence))
+            parts.append(_of_solution(prepared, solution, channel, evidence))
         except InputError as error:
             # A receiver that never had a fix must not take the run's other solutions with it.
             errors.append(error)
             parts.append(_failed(prepared, solution, error))
     if len(errors) == len(parts):
         raise errors[0]
-    # Each part was brought to the contract when it was made.
-    whole = {name: pl.concat([part[name] for part in parts]) for name in TABLES}
+    whole = {name: pl.concat([part[name] for part in parts]) if len(parts) > 1 else parts[0][name] for name in TABLES}
     return RunTables(run_id=run.run_id, **whole)
 
 
 def monitor_alone(run: RunLog, site: Site, vehicle: Vehicle, config: Configuration, solution: str) -> MonitoredSolution:
-    """What the train made of one solution, without a judge: for studies of what the monitors could have seen."""
+    """What the train made of one solution, without a judge: for studies of what monitors could detect.
+
+    Args:
+        run: the run as `read_run` yields it.
+        site: the site.
+        vehicle: what is known of the vehicle.
+        config: the configuration.
+        solution: name of the solution.
+
+    Returns:
+        Alignment, monitors and detected balises, with the solution on its path.
+
+    Raises:
+        InputError: the run has no such solution, or it cannot be replayed.
+    """
     if solution not in run.solutions():
         raise InputError("has no such solution", place=run.run_id, found=solution, expected=", ".join(run.solutions()))
     prepared = prepare(run, site, vehicle, config, clock_advice)
-    required_fit(prepared, solution, vehicle)
-    matches = _with_match(_compared_with(prepared), prepared, solution)
+    _, matches = _fitted(prepared, solution, _compared_with(prepared))
     return monitor_solution(prepared, solution, matches, prepared.evidence())
 
 
-def _compared_with(prepared: PreparedRun) -> Matches:
-    """The match of the solution that the channel monitor compares with, the only one that is kept over all solutions.
+def _compared_with(prepared: PreparedRun) -> Channel:
+    """The solution that the channel monitor compares with, the only one whose match is kept over all solutions.
 
     Empty where that solution does not fit the run or lies on no track: then it has a failed row of its own.
     """
@@ -77,36 +102,40 @@ def _compared_with(prepared: PreparedRun) -> Matches:
     if channel not in prepared.run.solutions():
         return {}
     try:
-        required_fit(prepared, channel, prepared.vehicle)
-        return {channel: prepared.match(channel)}
+        return {channel: (required_fit(prepared, channel, prepared.vehicle), prepared.match(channel))}
     except InputError:
         return {}
 
 
-def _with_match(channel_match: Matches, prepared: PreparedRun, solution: str) -> Matches:
-    return channel_match if solution in channel_match else {**channel_match, solution: prepared.match(solution)}
+def _fitted(prepared: PreparedRun, solution: str, channel: Channel) -> tuple[Fit, Matches]:
+    """How the solution fits the run, and its match beside that of the channel; raises `InputError` as both do."""
+    known = channel.get(solution)
+    fit, match = known or (required_fit(prepared, solution, prepared.vehicle), prepared.match(solution))
+    return fit, {**{name: other for name, (_, other) in channel.items()}, solution: match}
 
 
-def _of_solution(prepared: PreparedRun, solution: str, channel_match: Matches, evidence: TrainEvidence) -> Tables:
+def _of_solution(prepared: PreparedRun, solution: str, channel: Channel, evidence: TrainEvidence) -> Tables:
     """What the train made of one solution, what nobody would have noticed, and what the judge says of it.
 
     Raises `InputError` where the solution does not fit the run or lies on no track.
     """
-    fit = required_fit(prepared, solution, prepared.vehicle)
-    monitored = monitor_solution(prepared, solution, _with_match(channel_match, prepared, solution), evidence)
+    fit, matches = _fitted(prepared, solution, channel)
+    monitored = monitor_solution(prepared, solution, matches, evidence)
     unnoticed = unnoticed_of(monitored)
     judged = judge(_case(monitored, unnoticed, evidence, fit.leaps_s(evidence.in_step)))
     results = _results(monitored, judged, unnoticed, fit, evidence)
-    epochs = judged.epochs.with_columns(*results.lost.columns(), monitored.solution.fixes["satellites"])
+    suspect = pl.Series("suspect_after_the_fact", judged.suspect_after_the_fact)
+    of_fixes = monitored.solution.fixes["satellites"]
+    columns = (suspect, *results.lost.columns(), of_fixes, *unnoticed.epochs)
     tables = {
         "hazards": judged.hazards,
         "passages": judged.passages,
         "alarms": judged.alarms,
-        "epochs": epochs,
+        "epochs": pl.DataFrame([*judged.epochs.contract_series(), *columns]),
         "runs": summarise(results, prepared.config, prepared.provenance),
     }
     # Judged epochs have more columns than the contract: those end here.
-    return {name: conform(table, TABLES[name]) for name, table in tables.items()}
+    return {name: shaped(table, TABLES[name]) for name, table in tables.items()}
 
 
 def _case(
@@ -115,9 +144,8 @@ def _case(
     """The solution before the judge."""
     replayed = monitored.solution
     run = monitored.prepared.run
-    epochs = pl.concat([replayed.epochs, unnoticed.epochs], how="horizontal")
     return JudgeInput(
-        solution=replace(replayed, epochs=epochs, passages=replayed.passages.with_columns(unnoticed.passages)),
+        solution=replace(replayed, passages=replayed.passages.with_columns(unnoticed.passages)),
         evidence=evidence,
         odometry=monitored.odometry,
         vehicle=monitored.prepared.vehicle,
@@ -138,7 +166,6 @@ def _results(
     fit = with_checks(fit, accuracy)
     counts = prepared.counts.solutions[monitored.solution.name]
     odometry = prepared.odometry
-    epochs = EpochFigures.of_table(judged.epochs)
     columns = {
         "vehicle": prepared.figures_from,
         "faults_injected": run.faults is not None and run.faults.height > 0,
@@ -166,9 +193,9 @@ def _results(
     }
     return SolutionResults(
         solution=monitored.solution.name,
-        epochs=epochs,
-        lost=lost_columns(epochs, prepared.config),
+        lost=lost_columns(judged.epochs, prepared.config),
         judged=judged,
+        undetected=unnoticed.epochs,
         columns=columns,
         ingest=run.notes,
         notes=[*fit.notes, *notes_of_replay(monitored, evidence)],
@@ -180,11 +207,11 @@ def _results(
 
 def _track_assumed(judged: Judged) -> bool:
     """Positions in use or accepted balises would be right if the survey held the train's track."""
-    used = judged.epochs.select((pl.col("in_use") & pl.col("track_assumed")).any()).item()
-    return bool(used or judged.offers.select((pl.col("accepted") & pl.col("track_assumed")).any()).item())
+    used = judged.epochs.in_use & judged.epochs.judgements.track_assumed
+    return bool(used.any() or (judged.offers.accepted & judged.offers.judged.track_assumed).any())
 
 
 def _failed(prepared: PreparedRun, solution: str, error: InputError) -> Tables:
     """A solution without content but for the row that says why."""
     nothing = {name: table.create_empty() for name, table in TABLES.items()}
-    return nothing | {"runs": conform(failed_row(str(error), prepared.provenance, solution), TABLES["runs"])}
+    return nothing | {"runs": shaped(failed_row(str(error), prepared.provenance, solution), TABLES["runs"])}

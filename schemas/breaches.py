@@ -39,13 +39,22 @@ _WORDS = {
 
 
 def breach_messages(error: ValidationError, kind: type[BaseModel]) -> list[str]:
-    """Every breach with its path: an unknown key with the nearest known one, else what was found and expected."""
+    """Every breach with its path: an unknown key with the nearest known one, else what was found and expected.
+
+    Args:
+        error: what pydantic found.
+        kind: the model that was validated.
+
+    Returns:
+        One sentence per breach.
+    """
     return [
         _unknown(breach, kind) if breach["type"] == "extra_forbidden" else _wrong(breach) for breach in error.errors()
     ]
 
 
 def _wrong(breach: ErrorDetails) -> str:
+    """One breach, for people."""
     key = ".".join(map(str, breach["loc"])) or "(file)"
     text = _WORDS.get(breach["type"], breach["msg"].removeprefix("Value error, "))
     found = breach["input"]

@@ -23,6 +23,7 @@ def _estimate(name: str, meaning: str, unit: str = "1", ending: str = "") -> dic
 
 
 def _spread(name: str, meaning: str) -> dict[str, dy.Column]:
+    """Columns of mean, standard deviation and 95 % of a quantity."""
     return {
         f"{name}_mean_m": real("m", f"mean {meaning}"),
         f"{name}_sigma_m": real("m", f"standard deviation of the {meaning}", min=0),
@@ -32,6 +33,7 @@ def _spread(name: str, meaning: str) -> dict[str, dy.Column]:
 
 
 def _level_columns(level: str) -> dict[str, dy.Column]:
+    """Columns of one service level."""
     return {
         f"allowed_{level}_s": real("s", f"allowed T_D of the service level {level} (TVB eq. 7)", min=0),
         f"within_{level}": count(f"failures within the allowed T_D of {level}, what is unknown included"),
@@ -41,12 +43,20 @@ def _level_columns(level: str) -> dict[str, dy.Column]:
 
 
 def campaign_runs_schema(levels: Iterable[str]) -> type[dy.Schema]:
-    """Contract of `campaign/runs.parquet`; the service levels are those of the configuration."""
+    """Contract of `campaign/runs.parquet`; the service levels are those of the configuration.
+
+    Args:
+        levels: names of the service levels.
+
+    Returns:
+        The schema, with the rates and verdict of each level.
+    """
     return _campaign_runs_schema(tuple(levels))
 
 
 @lru_cache(maxsize=8)
 def _campaign_runs_schema(levels: tuple[str, ...]) -> type[dy.Schema]:
+    """Columns of the runs of a campaign, with those of its service levels."""
     columns: dict[str, dy.Column] = {"run_id": text("run"), **Runs.columns()}
     columns |= _estimate("hazard_rate", "faults per hour in use judged by a reference or balise reads", "1/h", "_per_h")
     columns["missed"] = count("faults with a failure that no monitor found by t_failure + budget")
@@ -64,6 +74,7 @@ CampaignRuns = campaign_runs_schema(SafetyConfig().service_levels)
 
 
 def _campaign_balises_schema() -> type[dy.Schema]:
+    """Columns of the balises of a campaign."""
     columns: dict[str, dy.Column] = {
         "solution": text("solution"),
         "balise_id": text("balise"),
@@ -105,6 +116,7 @@ CampaignBalises = _campaign_balises_schema()
 
 
 def _accuracy_schema() -> type[dy.Schema]:
+    """Columns of the accuracy by groups of balises."""
     columns: dict[str, dy.Column] = {
         "solution": text("solution"),
         "grouped_by": text("what the group has in common: all, netelement_id or speed_band_kmh"),
@@ -131,6 +143,7 @@ STANFORD = ("nominal", "misleading", "hazardous", "unavailable")
 
 
 def _figures_schema() -> type[dy.Schema]:
+    """Columns of the figures of each solution."""
     columns: dict[str, dy.Column] = {
         "solution": text("solution"),
         "runs": count("runs that were replayed"),

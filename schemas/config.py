@@ -94,6 +94,7 @@ class Configuration(Settings):
 
     @model_validator(mode="after")
     def _level_exists(self) -> Self:
+        """The service level of the hazards is one of those of the model."""
         if self.hazards.service_level not in self.safety.service_levels:
             known = ", ".join(sorted(self.safety.service_levels))
             raise ValueError(f"hazards.service_level {self.hazards.service_level!r} is none of {known}")
@@ -152,7 +153,20 @@ S = TypeVar("S", bound=Settings)
 def settings_from(
     data: Mapping[str, object], kind: type[S], place: str, remedy: str = "`balise dictionary` lists every key."
 ) -> S:
-    """Validate a mapping; every breach is listed with its path, as one `ConfigError`."""
+    """Validate a mapping as settings.
+
+    Args:
+        data: keys and values, as read from TOML.
+        kind: the model that they are settings of.
+        place: the file, for the error.
+        remedy: what to do about a breach, for the error.
+
+    Returns:
+        The validated settings.
+
+    Raises:
+        ConfigError: keys are unknown or values wrong; all of them are listed with their paths.
+    """
     try:
         return kind.model_validate(data)
     except ValidationError as error:
@@ -163,7 +177,18 @@ _DEEP_KEY = re.compile(r"""(?<![\w-])(?:(?:[\w-]++|"[^"\n]*+"|'[^'\n]*+')[ \t]*+
 
 
 def read_toml(path: Path, kind: type[BaliseError] = ConfigError) -> dict[str, object]:
-    """A TOML file as a mapping, or one error."""
+    """Read a TOML file as a mapping.
+
+    Args:
+        path: the file.
+        kind: class of the error to raise.
+
+    Returns:
+        Keys and values.
+
+    Raises:
+        BaliseError: of the class `kind`: the file cannot be read or is not TOML.
+    """
     try:
         if path.exists() and not path.is_file():  # a pipe or a device may be read for ever
             raise kind("is no regular file", place=str(path), expected="a TOML file")
@@ -173,7 +198,19 @@ def read_toml(path: Path, kind: type[BaliseError] = ConfigError) -> dict[str, ob
 
 
 def toml_of(content: bytes, place: str, kind: type[BaliseError] = ConfigError) -> dict[str, object]:
-    """TOML as a mapping, or one error."""
+    """Parse TOML as a mapping.
+
+    Args:
+        content: the bytes of a file.
+        place: its name, for the error.
+        kind: class of the error to raise.
+
+    Returns:
+        Keys and values.
+
+    Raises:
+        BaliseError: of the class `kind`: the content is not TOML.
+    """
     try:
         text = content.decode()
         if _DEEP_KEY.search(text):  # for which the parser takes time and memory that grow with the square of the depth
@@ -184,16 +221,41 @@ def toml_of(content: bytes, place: str, kind: type[BaliseError] = ConfigError) -
 
 
 def load_settings(path: Path | None, kind: type[S]) -> S:
-    """A settings file, or the defaults where none is given."""
+    """A settings file, or the defaults where none is given.
+
+    Args:
+        path: the file, or None.
+        kind: the model of its settings.
+
+    Returns:
+        The validated settings.
+
+    Raises:
+        ConfigError: the file cannot be read, or breaches the model.
+    """
     return kind() if path is None else settings_from(read_toml(path), kind, str(path))
 
 
 def to_toml(settings: Settings) -> str:
-    """The resolved settings as TOML; keys that are not set are left out."""
+    """The resolved settings as TOML; keys that are not set are left out.
+
+    Args:
+        settings: validated settings.
+
+    Returns:
+        The text of a TOML file.
+    """
     return tomli_w.dumps(settings.model_dump(mode="json", exclude_none=True))
 
 
 def digest_of(*parts: Settings) -> str:
-    """SHA-256 over the canonical JSON of settings, independent of how they were written."""
+    """SHA-256 over the canonical JSON of settings, independent of how they were written.
+
+    Args:
+        parts: settings, in an order that counts.
+
+    Returns:
+        64 hexadecimal digits.
+    """
     text = json.dumps([part.model_dump(mode="json") for part in parts], sort_keys=True)
     return hashlib.sha256(text.encode()).hexdigest()

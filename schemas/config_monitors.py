@@ -11,7 +11,17 @@ from schemas.tables import MONITORS
 
 
 def threshold_factor(false_alarm_probability: float) -> float:
-    """k_T: two-sided Gaussian quantile of the false-alarm probability (DIAG eq. 17); 5.3267 for 1e-7."""
+    """k_T: the Gaussian quantile of the false-alarm probability; 5.3267 for 1e-7.
+
+    Args:
+        false_alarm_probability: per sample, two-sided [1].
+
+    Returns:
+        k_T in standard deviations [1].
+
+    Source:
+        DIAG eq. 17.
+    """
     from scipy.special import ndtri  # most commands that read a configuration test nothing
 
     return float(-ndtri(false_alarm_probability / 2.0))
@@ -233,6 +243,7 @@ class MonitorConfig(Settings):
     @field_validator("ewma_alphas")
     @classmethod
     def _fastest_first(cls, alphas: tuple[float, float, float]) -> tuple[float, float, float]:
+        """Weights of the averages fall."""
         if not alphas[0] > alphas[1] > alphas[2]:
             raise ValueError(f"found {list(alphas)}; expected three falling weights, the fastest average first")
         return alphas
@@ -240,6 +251,7 @@ class MonitorConfig(Settings):
     @field_validator("disabled")
     @classmethod
     def _monitors_exist(cls, names: tuple[str, ...]) -> tuple[str, ...]:
+        """Names are those of monitors."""
         if unknown := [name for name in names if name not in MONITORS]:
             raise ValueError(f"no monitor is called {', '.join(unknown)}; expected some of {', '.join(MONITORS)}")
         return names

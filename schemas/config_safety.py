@@ -19,6 +19,7 @@ class ServiceLevel(Settings):
 
     @property
     def hazard_rate_per_h(self) -> float:
+        """Integrity risk per exposure time as a rate [1/h] (TVB section 5)."""
         return self.integrity_risk * 3600.0 / self.exposure_s
 
 

@@ -25,10 +25,20 @@ class _Rule:
 
 
 def conform(frame: pl.DataFrame, schema: type[dy.Schema]) -> pl.DataFrame:
-    """The frame with the contract's columns and dtypes, in its order.
+    """The frame with the contract's columns and dtypes, in its order, checked.
 
-    A breach is a defect of the program: `ValueError`, all breaches in one. Does what `schema.validate` does for
-    these rules column by column: on a table of a hundred columns planning that query takes longer than a replay.
+    Does what `schema.validate` does for these rules column by column: on a table of a hundred columns planning that
+    query takes longer than a replay.
+
+    Args:
+        frame: a table with the columns of the contract at least.
+        schema: the contract.
+
+    Returns:
+        The table.
+
+    Raises:
+        ValueError: values breach the contract: a defect of the program; all breaches in one.
     """
     table = shaped(frame, schema)
     pairs = list(zip(table, _rules(schema), strict=True))
@@ -40,7 +50,15 @@ def conform(frame: pl.DataFrame, schema: type[dy.Schema]) -> pl.DataFrame:
 
 
 def shaped(frame: pl.DataFrame, schema: type[dy.Schema]) -> pl.DataFrame:
-    """The contract's columns and dtypes, in its order; the values are taken as they are."""
+    """The contract's columns and dtypes, in its order; the values are taken as they are.
+
+    Args:
+        frame: a table with the columns of the contract at least.
+        schema: the contract.
+
+    Returns:
+        The table.
+    """
     series = {column.name: column for column in frame.get_columns()}
     if (list(series), [column.dtype for column in series.values()]) == _names_and_dtypes(schema):
         return frame
@@ -48,14 +66,29 @@ def shaped(frame: pl.DataFrame, schema: type[dy.Schema]) -> pl.DataFrame:
 
 
 def table_of_rows(rows: Sequence[Mapping[str, object]], dtypes: Mapping[str, pl.DataType]) -> pl.DataFrame:
-    """Rows by the names of these columns as a table; most runs have no hazard and no alarm, and columns are many."""
+    """Rows by the names of these columns as a table; most runs have no hazard and no alarm, and columns are many.
+
+    Args:
+        rows: values by column name, one mapping per row.
+        dtypes: the columns in order.
+
+    Returns:
+        The table.
+    """
     if not rows:
         return pl.DataFrame([pl.Series(name, dtype=dtype) for name, dtype in dtypes.items()])
     return pl.DataFrame(rows, schema=dtypes)
 
 
 def dtypes(schema: type[dy.Schema]) -> dict[str, pl.DataType]:
-    """The contract's columns in their order, with their dtypes."""
+    """The contract's columns in their order, with their dtypes.
+
+    Args:
+        schema: the contract of a table.
+
+    Returns:
+        Dtypes by column name.
+    """
     return {rule.name: rule.dtype for rule in _rules(schema)}
 
 
@@ -69,11 +102,13 @@ def meanings(schema: type[dy.Schema]) -> dict[str, dict[str, str]]:
 
 
 def _cast(series: pl.Series, dtype: pl.DataType) -> pl.Series:
+    """A series in a type."""
     return series if series.dtype == dtype else series.cast(dtype)
 
 
 @lru_cache(maxsize=64)
 def _names_and_dtypes(schema: type[dy.Schema]) -> tuple[list[str], list[pl.DataType]]:
+    """Names and types of the columns of a schema."""
     return [rule.name for rule in _rules(schema)], [rule.dtype for rule in _rules(schema)]
 
 
@@ -94,6 +129,7 @@ def _rules(schema: type[dy.Schema]) -> tuple[_Rule, ...]:
 
 
 def _bound(column: dy.Column, name: str) -> float | None:
+    """Bound of a column, if it has one."""
     bound = getattr(column, name, None)
     return bound if isinstance(bound, int | float) else None
 

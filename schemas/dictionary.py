@@ -25,6 +25,7 @@ Times are UTC, nanoseconds, GNSS time of validity. A null means "not known". Flo
 
 
 def _dtype(column: dy.Column) -> str:
+    """Type of a column, for people."""
     if isinstance(column, dy.Enum):
         return "enum " + " ".join(column.categories)
     if isinstance(column, dy.List):
@@ -45,7 +46,17 @@ def groups() -> dict[str, Mapping[str, type[dy.Schema]]]:
 
 
 def dictionary_frame(only: str | None = None) -> pl.DataFrame:
-    """One row per column, of all tables or `only` one: `group, table, column, dtype, unit, nullable, meaning`."""
+    """Every column of every table, or of one: one row per column.
+
+    Args:
+        only: name of a table, or None for all.
+
+    Returns:
+        `group, table, column, dtype, unit, nullable, meaning`.
+
+    Raises:
+        UsageError: there is no table of that name.
+    """
     known = [table for tables in groups().values() for table in tables]
     if only is not None and only not in known:
         raise UsageError("is not a table", place=only, expected=", ".join(known))
@@ -74,6 +85,7 @@ def settings_frame() -> pl.DataFrame:
 
 
 def _settings_rows(file: str, prefix: str, settings: BaseModel) -> list[tuple[str, str, str]]:
+    """Settings with units and meanings, sections within sections included."""
     rows: list[tuple[str, str, str]] = []
     for name in type(settings).model_fields:
         value = getattr(settings, name)
@@ -102,6 +114,7 @@ def dictionary_markdown() -> str:
 
 
 def _markdown_row(name: str, column: dy.Column) -> str:
+    """A column as a row of a table in Markdown."""
     unit = (column.metadata or {}).get("unit", "")
     nullable = "yes" if column.nullable else ""
     return f"| `{name}` | {_dtype(column)} | {unit} | {nullable} | {column.description or ''} |\n".replace(

@@ -99,6 +99,8 @@ class Timing(StrEnum):
 
 
 class Evidence(StrEnum):
+    """What a judgement rests on, the strongest first: where two kinds are needed, the weaker one is named."""
+
     REFERENCE = "reference"
     BALISE = "balise"
     ODOMETER = "odometer"
@@ -285,7 +287,7 @@ class VehicleFigures(StrEnum):
     NONE = "none"
 
 
-TRUTH = (Evidence.REFERENCE.value, Evidence.BALISE.value)
+TRUTH = tuple(kind.value for kind in Evidence if kind is not Evidence.ODOMETER)
 """Evidence that can call a position right; the odometer alone sees errors beyond its confidence only."""
 
 

@@ -14,7 +14,14 @@ _HIDDEN = re.compile("[\x00-\x09\x0b-\x1f\x7f-\x9f\u200e\u200f\u2028-\u202e\u206
 
 
 def visible(text: str) -> str:
-    """The text with control characters, and bytes that are none, escaped: no log or file name steers a terminal."""
+    """The text with control characters, and bytes that are none, escaped: no log or file name steers a terminal.
+
+    Args:
+        text: any text.
+
+    Returns:
+        The text without characters that a terminal obeys.
+    """
     return _HIDDEN.sub(lambda found: found[0].encode("unicode_escape").decode(), text)
 
 
@@ -64,11 +71,19 @@ def _rebuild(
     expected: str | None,
     remedy: str | None,
 ) -> BaliseError:
+    """An error, rebuilt in another process."""
     return kind(message, place=place, found=found, expected=expected, remedy=remedy)
 
 
 def listed(problems: Sequence[str]) -> str:
-    """Problems of one file as one message: a single one as it is, several one below the other."""
+    """Problems of one file as one message: a single one as it is, several one below the other.
+
+    Args:
+        problems: one sentence each, at least one.
+
+    Returns:
+        The message.
+    """
     if len(problems) == 1:
         return problems[0]
     return "\n  ".join([f"{len(problems)} problems in this file", *problems]) + "\n"

@@ -10,6 +10,7 @@ from schemas.tables import SCALES
 
 
 def _with_bounds(name: str, meaning: str) -> dict[str, dy.Column]:
+    """Columns of a share and its bounds."""
     return {
         name: real("1", meaning, min=0, max=1),
         f"{name}_low": real("1", f"{meaning}: lower 95 % bound, over passes", min=0, max=1),
@@ -33,6 +34,7 @@ _CELL: dict[str, dy.Column] = {
 
 
 def _injections_schema() -> type[dy.Schema]:
+    """Columns of the injections."""
     thresholds = {
         f"along_{scale}_threshold": real("m/s", f"threshold of along_{scale} there", min=0) for scale in SCALES
     }
@@ -80,6 +82,7 @@ ExperimentInjections = _injections_schema()
 
 
 def _cells_schema() -> type[dy.Schema]:
+    """Columns of the cells."""
     columns: dict[str, dy.Column] = {
         **_CELL,
         "wanted": count("injections that the plan asks for"),
@@ -114,6 +117,7 @@ ExperimentCells = _cells_schema()
 
 
 def _pmd_schema() -> type[dy.Schema]:
+    """Columns of the probability of missed detection over time."""
     columns: dict[str, dy.Column] = {
         **_CELL,
         "time_since_failure_s": real("s", "time after the failure, negative before it", nullable=False),

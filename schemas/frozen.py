@@ -21,14 +21,20 @@ def frozen(cls: Class, /) -> Class: ...
 def frozen(*, eq: bool = True) -> Callable[[Class], Class]: ...
 @dataclass_transform(frozen_default=True, field_specifiers=(field,))
 def frozen(cls: Any = None, /, *, eq: bool = True) -> Any:
-    """As `dataclass(frozen=True, eq=eq)`: arguments by place or name, and values that never change.
+    """Make a class of named values that never change, as `dataclass(frozen=True, eq=eq)`.
 
-    Equal and hashed by value; without `eq` one is only equal to itself.
+    Args:
+        cls: the class, where the decorator is used without arguments.
+        eq: compare and hash by value; else an object is only equal to itself.
+
+    Returns:
+        The class, or a decorator for it.
     """
     return (lambda named: _made(named, eq)) if cls is None else _made(cls, eq)
 
 
 def _made(cls: type, eq: bool) -> type:
+    """The class with its methods of a data class that cannot be changed."""
     if cls.__doc__ is None:
         cls.__doc__ = cls.__name__  # or `dataclass` writes the signature, by `inspect`
     made: Any = dataclass(init=False, repr=False, eq=False)(cls)
@@ -49,6 +55,7 @@ def _made(cls: type, eq: bool) -> type:
 
 
 def _values_of(names: list[str]) -> Callable[[Any], tuple[Any, ...]]:
+    """What gives the values of some fields."""
     if not names:
         return lambda _: ()
     if len(names) == 1:
@@ -57,6 +64,8 @@ def _values_of(names: list[str]) -> Callable[[Any], tuple[Any, ...]]:
 
 
 def _equality(values: Callable[[Any], tuple[Any, ...]]) -> Callable[[Any, object], bool]:
+    """What compares two of a class by their values."""
+
     def equals(self: Any, other: object) -> bool:
         return bool(values(self) == values(other)) if other.__class__ is self.__class__ else NotImplemented
 
@@ -66,6 +75,7 @@ def _equality(values: Callable[[Any], tuple[Any, ...]]) -> Callable[[Any, object
 def _initialiser(
     name: str, shown: Mapping[str, Field[Any]], after: Callable[[Any], None] | None
 ) -> Callable[..., None]:
+    """What sets the fields of a new instance."""
     names = tuple(each.name for each in shown.values() if each.init and not each.kw_only)
     known = frozenset(each.name for each in shown.values() if each.init)
     count, most = len(shown), len(names)
@@ -118,13 +128,16 @@ def _wrong(
 
 
 def _refuse_to_set(self: Any, name: str, value: Any) -> None:
+    """Refuse to change a field."""
     raise FrozenInstanceError(f"cannot assign to field {name!r}")
 
 
 def _refuse_to_delete(self: Any, name: str) -> None:
+    """Refuse to delete a field."""
     raise FrozenInstanceError(f"cannot delete field {name!r}")
 
 
 def _shown(self: Any) -> str:
+    """The fields with their values, as `dataclass` shows them."""
     values = ", ".join(f"{each.name}={getattr(self, each.name)!r}" for each in fields(self) if each.repr)
     return f"{self.__class__.__qualname__}({values})"

@@ -47,6 +47,7 @@ class Odometer(dy.Schema):
 
     @dy.rule()
     def distance_or_speed(cls):  # type: ignore[no-untyped-def]  # noqa: N805
+        """Every row has at least one of the two."""
         return cls.distance_m.col.is_not_null() | cls.speed_mps.col.is_not_null()
 
 

@@ -54,7 +54,17 @@ class Limits(NamedTuple):
 
 
 def limits_of(hazards: _Hazards) -> Limits:
-    """The limits of a configuration."""
+    """The limits of a configuration.
+
+    Args:
+        hazards: the section `hazards` of a configuration.
+
+    Returns:
+        Each use of `failure_limit_m` under its own name [m].
+
+    Source:
+        DOMAIN section 5.
+    """
     failure_m = hazards.failure_limit_m
     half_m = 0.5 * failure_m
     return Limits(
@@ -76,13 +86,31 @@ def limits_of(hazards: _Hazards) -> Limits:
 
 
 def noise_limit_m(failure_m: float, factor: float) -> float:
-    """The largest fast noise with which a position failure still shows: F / (2 k_T) [m] (DOMAIN section 3)."""
+    """The largest fast noise with which a position failure still shows: F / (2 k_T).
+
+    Args:
+        failure_m: failure limit F [m].
+        factor: threshold factor k_T [1].
+
+    Returns:
+        Largest noise [m].
+
+    Source:
+        DOMAIN section 3.
+    """
     return failure_m / (2.0 * factor)
 
 
 def scatter_limit_m(failure_m: float, factor: float) -> float:
-    """The largest deviation of an odometer's row, or of digits, that thresholds allow for: F / (k_T sqrt 2) [m].
+    """The largest deviation of an odometer's row, or of digits, that thresholds allow for: F / (k_T sqrt 2).
 
     With more, k_T sqrt(2) sigma of two rows would exceed the failure limit: false alarms rather than a failure hidden.
+
+    Args:
+        failure_m: failure limit F [m].
+        factor: threshold factor k_T [1].
+
+    Returns:
+        Largest deviation [m].
     """
     return failure_m / (factor * math.sqrt(2.0))

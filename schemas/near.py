@@ -10,7 +10,15 @@ _SHOWN = 3
 
 
 def nearest(name: str, known: Iterable[str]) -> list[str]:
-    """The three that are most like a name, by its words and by its letters, however unlike they are."""
+    """The three that are most like a name, by its words and by its letters, however unlike they are.
+
+    Args:
+        name: what was written.
+        known: the names there are.
+
+    Returns:
+        Three names at most, the most alike first.
+    """
 
     def unlike(item: str) -> tuple[float, str]:
         words, others = (set(text.lower().split("_")) for text in (name, item))
@@ -21,7 +29,15 @@ def nearest(name: str, known: Iterable[str]) -> list[str]:
 
 
 def did_you_mean(name: str, known: Iterable[str]) -> str:
-    """` (did you mean `antenna_height_m`?)` to put behind a message; empty where nothing is alike."""
+    """` (did you mean `antenna_height_m`?)` to put behind a message; empty where nothing is alike.
+
+    Args:
+        name: what was written.
+        known: the names there are.
+
+    Returns:
+        The end of a message, with a space before it, or nothing.
+    """
     by_lower = {item.lower(): item for item in known}
     near = difflib.get_close_matches(name.lower(), list(by_lower), n=_SHOWN, cutoff=_ALIKE)
     if not near:

@@ -47,6 +47,7 @@ def _possible(path: str) -> str:
 
 
 def _naming(path: str) -> str:
+    """A path that names a run."""
     if Path(path).name in ("", ".."):
         raise ValueError("names no run")
     return path
@@ -76,7 +77,7 @@ class LogEntry(Settings):
     balise_reads: tuple[LogMapping, ...] = ()
 
     def mappings(self) -> dict[str, tuple[StreamMapping, ...]]:
-        """By stream, each with the topic that it is for: of tables the name of the file."""
+        """Mappings by stream, each with the topic that it is for: of tables the name of the file."""
         names = [Path(file).name for file in self.files]
         return {
             stream: tuple(
@@ -98,6 +99,7 @@ class ConvertEntry(Settings):
 
     @property
     def run_id(self) -> str:
+        """The run id that the converted run has."""
         return Path(self.to).name.removesuffix(".mcap")
 
 
@@ -179,6 +181,7 @@ class Project(Settings):
 
     @model_validator(mode="after")
     def _consistent(self) -> Self:
+        """What is stated of a project fits together."""
         twice = [run for run, count in Counter(entry.run_id for entry in self.convert).items() if count > 1]
         if twice:
             raise ValueError(f"convert: {', '.join(twice)} stands there twice; results are stored by run id")
@@ -191,24 +194,62 @@ _OWN_KEYS = Project.model_fields.keys() - Configuration.model_fields.keys()
 
 
 def is_project(data: dict[str, object]) -> bool:
-    """Whether TOML is a project: it has keys that no configuration has (of tables of one name a project has none)."""
+    """Whether TOML is a project: it has keys that no configuration has (of tables of one name a project has none).
+
+    Args:
+        data: TOML as a mapping.
+
+    Returns:
+        Whether `balise run` can take it.
+    """
     return isinstance(data.get("site"), str) or not data.keys().isdisjoint(_OWN_KEYS)
 
 
 def load_project(file: Path) -> Project:
-    """Raises `ConfigError` with every breach; an unknown key is told with the nearest known one."""
+    """Read a project file.
+
+    Args:
+        file: `balise.toml`, or a file of another name.
+
+    Returns:
+        The project.
+
+    Raises:
+        ConfigError: the file cannot be read or breaches the model; an unknown key is named with the nearest known one.
+    """
     return settings_from(read_toml(file), Project, str(file), _REMEDY)
 
 
 def load_configuration(file: Path | None) -> Configuration:
-    """A configuration file, or the configuration that a project file stands for."""
+    """A configuration file, or the configuration that a project file stands for.
+
+    Args:
+        file: a configuration or project file, or None for the defaults.
+
+    Returns:
+        The configuration.
+
+    Raises:
+        ConfigError: the file cannot be read or breaches its model.
+    """
     if file is None or not is_project(data := read_toml(file)):
         return load_settings(file, Configuration)
     return configuration_of(settings_from(data, Project, str(file), _REMEDY), file)
 
 
 def configuration_of(project: Project, file: Path) -> Configuration:
-    """The configuration that a project at this file stands for."""
+    """The configuration that a project at this file stands for.
+
+    Args:
+        project: a project.
+        file: its file, to whose folder its paths are relative.
+
+    Returns:
+        The configuration, with survey and service level as the project has them.
+
+    Raises:
+        ConfigError: the configuration file that it names cannot be used.
+    """
     # By name: the project's folder may not exist yet.
     named = None if project.config is None else Path(os.path.normpath(file.parent / project.config))
     config = load_settings(named, Configuration)

@@ -63,10 +63,12 @@ class RunLog:
     other_odometers: tuple[pl.DataFrame, ...] = ()
 
     def stream(self, name: Stream) -> pl.DataFrame | None:
+        """One of its streams by name, or None."""
         frame: pl.DataFrame | None = getattr(self, name)
         return frame
 
     def with_streams(self, **streams: pl.DataFrame | None) -> RunLog:
+        """The run with some streams replaced."""
         return replace(self, **streams)  # type: ignore[arg-type]
 
     def solutions(self) -> list[str]:
@@ -117,7 +119,10 @@ class Site:
 
 @frozen
 class RunTables:
-    """The five output tables of one run (`schemas.tables`), all solutions in each."""
+    """The five output tables of one run, all solutions in each, brought to their contract (`schemas.tables`).
+
+    Raises `ValueError` where a table breaks it, which is a defect of the program.
+    """
 
     run_id: str
     hazards: pl.DataFrame
@@ -125,3 +130,11 @@ class RunTables:
     alarms: pl.DataFrame
     epochs: pl.DataFrame
     runs: pl.DataFrame
+
+    def __post_init__(self) -> None:
+        # Imported here because it takes a while, and the parent of a campaign holds no tables.
+        from schemas.conform import conform
+        from schemas.tables import TABLES
+
+        for name, schema in TABLES.items():
+            object.__setattr__(self, name, conform(getattr(self, name), schema))

@@ -79,7 +79,14 @@ class Key:
 
 
 def field_texts(model: type[BaseModel]) -> dict[str, tuple[str, str]]:
-    """Meaning and reason of each field of a model: the paragraphs of the string under it."""
+    """Meaning and reason of each field of a model: the paragraphs of the string under it.
+
+    Args:
+        model: a model of settings.
+
+    Returns:
+        (meaning, reason) by field.
+    """
     body = ast.parse(textwrap.dedent(inspect.getsource(model))).body[0]
     assert isinstance(body, ast.ClassDef)
     texts: dict[str, tuple[str, str]] = {}
@@ -91,7 +98,15 @@ def field_texts(model: type[BaseModel]) -> dict[str, tuple[str, str]]:
 
 
 def keys(model: type[BaseModel], prefix: str = "") -> Iterator[Key]:
-    """Every key of a model in order; nested models by dotted names."""
+    """Every key of a model in order; nested models by dotted names.
+
+    Args:
+        model: a model of settings.
+        prefix: dotted name of the model, with a dot at its end.
+
+    Returns:
+        Keys with default, meaning and reason.
+    """
     texts = field_texts(model)
     for name, field in model.model_fields.items():
         value = None if field.is_required() else field.get_default(call_default_factory=True)

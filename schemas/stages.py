@@ -7,18 +7,17 @@ for what reads tables.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import fields
+from enum import StrEnum
 from functools import cached_property
-from typing import Any, Self
+from typing import Any
 
-import dataframely as dy
 import numpy as np
 import polars as pl
 
-from schemas.arrays import Bools, Floats, Ints, flags, floats, ints, times_ns, truths
-from schemas.columns import flag, instant, one_of, real, text
-from schemas.enums import BaliseKind, Evidence, Judgement, LdsMode, LdsState, NotEvaluated, PassageStatus, SigmaSource
+from schemas.arrays import Bools, Floats, Ints
+from schemas.enums import Evidence, Judgement, LdsMode, LdsState, LostTo, NotEvaluated, PassageStatus, SigmaSource
 from schemas.frozen import frozen
 
 # Confidence where one track is left of the set of those that the positions do not reject (DOMAIN section 2).
@@ -29,12 +28,30 @@ SIGMA_SOURCES = tuple(source.value for source in SigmaSource)
 REASONS = tuple(NotEvaluated)
 NO_REASON = -1
 _REASON_WORDS = pl.Series([reason.value for reason in REASONS] + [None], dtype=pl.String)
-_SOURCE_WORDS = pl.Series([*SIGMA_SOURCES, None], dtype=pl.Enum(SIGMA_SOURCES))
 
 
 def reason_words(reason: Ints) -> pl.Series:
-    """Numbers in `REASONS` as words, null for `NO_REASON`; shape (epochs,)."""
-    return _gathered(_REASON_WORDS, reason)
+    """Numbers of reasons as words, null for `NO_REASON`.
+
+    Args:
+        reason: numbers in `REASONS`, shape (n,).
+
+    Returns:
+        Words of n rows.
+    """
+    return gathered(_REASON_WORDS, reason)
+
+
+def arrays_of(columns: type[Any]) -> tuple[str, ...]:
+    """The names of the arrays of such a class, in their order.
+
+    Args:
+        columns: a frozen class with arrays.
+
+    Returns:
+        Names of attributes.
+    """
+    return tuple(one.name for one in fields(columns) if one.type in ("Ints", "Floats", "Bools"))
 
 
 @frozen
@@ -104,13 +121,17 @@ class MatchedEpochs:
     """The same of the height [m]."""
 
     def columns(self) -> dict[str, Any]:
-        """The attributes by name, for a frame that has more of them."""
+        """The attributes by name, for epochs that have more of them."""
         return {one.name: getattr(self, one.name) for one in fields(self)}
 
     @property
     def height(self) -> int:
         """Number of epochs."""
         return self.t_ns.size
+
+    def element_by(self, numbers: Mapping[str, int]) -> Ints:
+        """The matched net elements by other numbers of theirs, -1 for none."""
+        return np.array([*(numbers.get(name, -1) for name in self.elements), -1])[self.element]
 
     @property
     def positioned(self) -> Bools:
@@ -128,25 +149,18 @@ class MatchedEpochs:
         return np.asarray(self.gate_probability >= ONE_TRACK_LEFT)
 
     @cached_property
-    def netelement_id(self) -> pl.Series:
-        """Names of the matched net elements, null for none."""
-        return _gathered(pl.Series([*self.elements, None], dtype=pl.String), self.element)
-
-    @cached_property
     def table(self) -> pl.DataFrame:
         """The columns as a frame: names of net elements for their numbers, null where not known."""
-        return pl.DataFrame([_series(self, field.name) for field in fields(self) if field.name != "elements"])
+        return pl.DataFrame(self.series())
 
-    @classmethod
-    def of_table(cls, table: pl.DataFrame) -> Self:
-        """The arrays of a frame with these columns; what it lacks is not known."""
-        elements: list[str] = []
-        if "netelement_id" in table.columns:
-            elements = table["netelement_id"].drop_nulls().unique(maintain_order=True).to_list()
-        arrays = {
-            one.name: _array(one.name, str(one.type), table, elements) for one in fields(cls) if one.name != "elements"
-        }
-        return cls(elements=elements, **arrays)
+    def series(self) -> list[pl.Series]:
+        """The columns of `table`."""
+        t, *others = (series_of(self, name) for name in arrays_of(type(self)))
+        return [t, self.solution_series(), *others]
+
+    def solution_series(self) -> pl.Series:
+        """The name of the solution at each epoch."""
+        return pl.Series("solution", [self.solution], dtype=pl.String).new_from_index(0, self.height)
 
 
 @frozen
@@ -202,273 +216,178 @@ class AlignedEpochs(MatchedEpochs):
     """Standard deviation of the latency [s]."""
 
 
-def _gathered(words: pl.Series, number: Ints) -> pl.Series:
-    """Words by their number, the last of them for -1."""
+_ENUMERATIONS: Mapping[str, type[StrEnum]] = {
+    "sigma_source": SigmaSource,
+    "lds_mode": LdsMode,
+    "withheld_for": LostTo,
+    "judgement": Judgement,
+    "evidence": Evidence,
+    "lds_state": LdsState,
+}
+"""Columns that hold words of an enumeration, in arrays by their number in it."""
+
+
+def words_of(enumeration: type[StrEnum]) -> pl.Series:
+    """The words of an enumeration, for `gathered`.
+
+    Args:
+        enumeration: an enumeration of words.
+
+    Returns:
+        Its words in their order, and null behind them, for numbers of -1.
+    """
+    values = [one.value for one in enumeration]
+    return pl.Series([*values, None], dtype=pl.Enum(values))
+
+
+# Made once: an enumeration takes longer to make than to index.
+_WORDS = {name: words_of(enumeration) for name, enumeration in _ENUMERATIONS.items()}
+
+
+def gathered(words: pl.Series, number: Ints) -> pl.Series:
+    """Words by their number.
+
+    Args:
+        words: as `words_of` makes them; the last stands for -1.
+        number: numbers of words, shape (n,).
+
+    Returns:
+        Words of n rows.
+    """
     return words[pl.Series(np.where(number < 0, len(words) - 1, number).astype(np.uint32))]
 
 
-def _series(epochs: MatchedEpochs, name: str) -> pl.Series:
-    """One column of the frame."""
+def instants(name: str, t_ns: Ints) -> pl.Series:
+    """Times as a column.
+
+    Args:
+        name: of the column.
+        t_ns: times [ns since 1970, UTC], shape (n,).
+
+    Returns:
+        Times of n rows.
+    """
+    return pl.Series(name, t_ns, dtype=pl.Int64).cast(INSTANT)
+
+
+def series_of(epochs: Any, name: str) -> pl.Series:
+    """One array of epochs as a column: words for numbers of words, null for what is not known.
+
+    Args:
+        epochs: a class of epochs in arrays, n of them.
+        name: of the array.
+
+    Returns:
+        The column of n rows, by the name that it has in tables.
+    """
     values = getattr(epochs, name)
     match name:
         case "t_ns":
-            return pl.Series("t", values, dtype=pl.Int64).cast(INSTANT)
-        case "solution":
-            return pl.Series(name, [values], dtype=pl.String).new_from_index(0, epochs.height)
+            return instants("t", values)
+        case "at_ns":
+            return instants("at", values)
         case "element":
-            return epochs.netelement_id.alias("netelement_id")
+            return gathered(pl.Series([*epochs.elements, None], dtype=pl.String), values).alias("netelement_id")
+        case "lrvb":
+            return gathered(pl.Series([*epochs.lrvb_ids, None], dtype=pl.String), values).alias("lrvb_id")
         case "leg":
             return pl.Series(name, np.where(values < 0, np.nan, values), nan_to_null=True).cast(pl.Int32)
-        case "sigma_source":
-            return _gathered(_SOURCE_WORDS, values).alias(name)
         case "odometer_reason":
             return reason_words(values).alias(name)
         case "direction":
             return pl.Series(name, values.astype(np.int8))
+    if name in _WORDS:
+        return gathered(_WORDS[name], values).alias(name)
     return pl.Series(name, values, nan_to_null=values.dtype == np.float64)
 
 
-def _array(name: str, kind: str, table: pl.DataFrame, elements: Sequence[str]) -> Any:
-    """One column of a frame as an array; not known where the frame lacks it."""
-    column = {"t_ns": "t", "element": "netelement_id"}.get(name, name)
-    known = column in table.columns
-    if name == "t_ns":
-        return times_ns(table)
-    if name == "solution":
-        return str(table[column][0]) if known and table.height else "primary"
-    if kind == "Floats":
-        return floats(table, column) if known else np.full(table.height, np.nan)
-    if kind == "Bools":
-        return truths(table[column]) if known else np.zeros(table.height, dtype=np.bool_)
-    if not known:
-        return np.full(table.height, {"leg": 0, "direction": 1}.get(name, -1))
-    words = {"element": elements, "sigma_source": SIGMA_SOURCES, "odometer_reason": [one.value for one in REASONS]}
-    if name in words:
-        numbers = {word: number for number, word in enumerate(words[name])}
-        return ints(table[column].cast(pl.String).replace_strict(numbers, default=None, return_dtype=pl.Int64))
-    return ints(table[column])
+@frozen
+class LdsEpochs:
+    """What the LDS says of each epoch; arrays of shape (epochs,)."""
+
+    lds_mode: Ints
+    """Mode of the location determination system, by number in `LdsMode`."""
+    tvb: Bools
+    """The position is a travelling virtual balise (TVB): validated, in use, usable."""
+    lrvb: Ints
+    """Last relevant virtual balise by its number in `lrvb_ids`; -1 before the first."""
+    lrvb_ids: Sequence[str]
+    """Names of balises."""
+    distance_from_lrvb_m: Floats
+    """Odometer distance since the LRVB [m]."""
+    doubt_over_m: Floats
+    """By how much the odometer may over-read since then (SUBSET-026 3.6.4) [m]."""
+    doubt_under_m: Floats
+    """By how much it may under-read [m]."""
+    exposure_s: Floats
+    """Time since the last validated position before this one [s]: TVB eq. 7."""
+    negated: Bools
+    """The LDS negated the position."""
+    withheld_for: Ints
+    """What the position is withheld for, by number in `LostTo`; -1 where it is not."""
+    diagnosis_faulty: Bools
+    """P3 (DOMAIN section 4): `along_raw` has no verdict, and the position is not withheld."""
+    alarm: Bools
+    """A monitor fails."""
+
+    def columns(self) -> dict[str, Any]:
+        """The attributes by name, for epochs that have more of them."""
+        return {one.name: getattr(self, one.name) for one in fields(self)}
+
+    @cached_property
+    def table(self) -> pl.DataFrame:
+        """The columns as a frame, with `withheld`."""
+        columns = [series_of(self, name) for name in arrays_of(type(self))]
+        return pl.DataFrame([*columns, pl.Series("withheld", self.withheld)])
+
+    @property
+    def withheld(self) -> Bools:
+        """The train does not use the position, though no monitor failed."""
+        return np.greater_equal(self.withheld_for, 0)
 
 
 @frozen
-class EpochFigures:
-    """The judged epochs of a solution, as far as the figures of a run are made of them; arrays of shape (epochs,)."""
+class Crossings:
+    """Crossings of balises by the raw matched position, and telegrams read; arrays of shape (crossings,).
 
-    t_ns: Ints
-    """Stamp of the epoch [ns since 1970, UTC]."""
-    at_ns: Ints
-    """The instant at which the position is judged [ns]: its stamp less the latency of the vehicle file."""
+    In order of time; the place of a crossing among them is its `crossing_id` in the tables.
+    """
+
+    balise_id: Sequence[str]
+    """Balise."""
+    netelement_id: Sequence[str]
+    """Net element of the balise."""
+    measure_m: Floats
+    """Its measure there [m]."""
+    leg: Ints
+    """Leg of the path."""
     path_m: Floats
-    """Path position [m]."""
-    on_track: Bools
-    """As in `MatchedEpochs`."""
-    path_probability: Floats
-    """Confidence in the track in hindsight [1]."""
-    gate_probability: Floats
-    """The same by what was known then [1]."""
-    confidence_m: Floats
-    """Half-width of the confidence interval along the track [m]."""
-    hpl_m: Floats
-    """Horizontal protection level of the receiver [m]."""
-    speed_mps: Floats
-    """Speed along growing path [m/s]."""
-    without_odometer: Bools
-    """There is no odometer here."""
-    tvb: Bools
-    """The position is a train-borne virtual balise (TVB)."""
-    negated: Bools
-    """The LDS negated the position."""
-    alarm: Bools
-    """A monitor fails."""
-    fail_safe: Bools
-    """Mode of the LDS."""
-    withheld_for: Ints
-    """What the position is withheld for, by number in `LostTo`; -1 where it is not."""
-    exposure_s: Floats
-    """Time since the last validated position before this one [s]."""
-    judgement: Ints
-    """What the evidence says of the position, by number in `Judgement`."""
-    error_low_m: Floats
-    """Least error in the direction of travel that the evidence leaves [m]."""
-    error_high_m: Floats
-    """Largest error in the direction of travel that the evidence leaves [m]."""
-    error_along_m: Floats
-    """Error where reference or reads give it to `known_error_m` [m]."""
-    moves: Bools
-    """The train moves from here to the next epoch, as is known."""
-    may_move: Bools
-    """It does, or nobody knows (DOMAIN section 5.5)."""
-    undiagnosed: Bools
-    """State P3: no verdict of `along_raw`, by the LDS, or the odometer is wrong."""
-    in_use: Bools
-    """Fix valid, unambiguous, confident, not negated, not withheld."""
-    used_s: Floats
-    """Time in use that the epoch stands for [s]."""
-    counted_s: Floats
-    """Time that the epoch stands for in shares of time [s]."""
-    lds_state: Ints
-    """State of the reactive LDS by number in `LdsState`; -1 where it needs a truth that is missing."""
-    table: pl.DataFrame
-    """All columns of the epochs, for what reads few of them, or names them."""
-
-    @classmethod
-    def of_table(cls, table: pl.DataFrame) -> EpochFigures:
-        """The arrays of judged epochs."""
-        moving = table["moving"]
-        moves = truths(moving)
-        return cls(
-            t_ns=times_ns(table),
-            at_ns=times_ns(table, "at") if "at" in table.columns else times_ns(table),
-            on_track=flags(table, "on_track"),
-            without_odometer=table["odometer_reason"].is_not_null().to_numpy(),
-            tvb=flags(table, "tvb"),
-            negated=flags(table, "negated"),
-            alarm=flags(table, "alarm"),
-            fail_safe=_numbers(table["lds_mode"]) == tuple(LdsMode).index(LdsMode.FAIL_SAFE),
-            withheld_for=_numbers(table["withheld_for"]),
-            judgement=_numbers(table["judgement"]),
-            moves=moves,
-            may_move=moves | moving.is_null().to_numpy(),
-            undiagnosed=flags(table, "undiagnosed"),
-            in_use=flags(table, "in_use"),
-            lds_state=_numbers(table["lds_state"]),
-            table=table,
-            **{name: floats(table, name) for name in _FIGURES},
-        )
-
-    def where(self, chosen: Bools) -> EpochFigures:
-        """Some of the epochs."""
-        return EpochFigures.of_table(self.table.filter(pl.Series(chosen)))
+    """Path position of the balise [m]."""
+    virtual: Bools
+    """A virtual balise, crossed by the position; else a physical one, read."""
+    before: Ints
+    """Row of the last epoch before the crossing with a position; of a telegram any."""
+    epoch: Ints
+    """Row of the first epoch at or after the crossing."""
+    t_ns: Ints
+    """The crossing, interpolated; of a telegram its own time; after a gap that of `epoch` [ns since 1970, UTC]."""
+    sense: Ints
+    """+1 passed along growing path, -1 against it."""
+    direction: Ints
+    """Direction of travel at the crossing, +1 or -1 along growing path."""
+    odometer_m: Floats
+    """Odometer distance at the crossing [m]."""
+    offered: Bools
+    """Offered to the train; false: inside a gap, or crossed again before the balise was re-armed."""
+    status: Ints
+    """What became of it, by number in `PassageStatus`; -1 where crossed again before the balise was re-armed."""
 
     @property
-    def height(self) -> int:
-        """Number of epochs."""
+    def size(self) -> int:
+        """Number of crossings."""
         return self.t_ns.size
 
     @property
-    def usable(self) -> Bools:
-        """Epochs with a position on the track."""
-        return np.isfinite(self.path_m) & self.on_track
-
-    @property
-    def unambiguous(self) -> Bools:
-        """One track is left for the position by what the train knew then."""
-        return np.asarray(self.gate_probability >= ONE_TRACK_LEFT)
-
-    @property
-    def valid(self) -> Bools:
-        """TVBs while it is known whether the train moves: a TVB where nobody knows counts for no availability."""
-        return self.tvb & (self.moves | ~self.may_move)
-
-    @property
-    def judged(self) -> Bools:
-        """The evidence calls the position right or wrong (DOMAIN section 5.2)."""
-        return self.is_judged(Judgement.RIGHT) | self.is_judged(Judgement.WRONG)
-
-    def is_judged(self, judgement: Judgement) -> Bools:
-        return np.asarray(self.judgement == tuple(Judgement).index(judgement))
-
-    def confident(self, limit_m: float) -> Bools:
-        """The confidence interval along the track is within its limit."""
-        return np.asarray(self.confidence_m <= limit_m)
-
-
-_FIGURES = (
-    *("path_m", "path_probability", "gate_probability", "confidence_m", "hpl_m", "speed_mps", "exposure_s"),
-    *("error_low_m", "error_high_m", "error_along_m", "used_s", "counted_s"),
-)
-
-
-def _numbers(words: pl.Series) -> Ints:
-    """Words of an enumeration by their number in it, -1 for null."""
-    return ints(words.to_physical())
-
-
-class Crossings(dy.Schema):
-    """One row per crossing of a balise by the raw matched position, or per telegram read, in order of time.
-
-    The LDS finds each crossing once and says what became of it; who needs it later joins by `crossing_id`.
-    """
-
-    crossing_id = dy.Int64(min=0, description="0, 1, ... in order of time within the solution")
-    balise_id = text("balise")
-    kind = one_of(BaliseKind, "virtual: crossed by the position; physical: read")
-    netelement_id = text("net element of the balise")
-    measure_m = real("m", "measure of the balise", nullable=False)
-    leg = dy.Int32(description="leg of the path")
-    path_m = real("m", "path position of the balise", nullable=False)
-    before = dy.Int64(min=0, description="row of the last epoch before the crossing with a position; of a telegram any")
-    epoch = dy.Int64(min=0, description="row of the first epoch at or after the crossing")
-    t = instant("the crossing, interpolated; of a telegram its own time; after a gap that of `epoch`")
-    sense = dy.Int8(description="+1 passed along growing path, -1 against it")
-    direction = dy.Int8(description="direction of travel at the crossing, +1 or -1 along growing path")
-    odometer_m = real("m", "odometer distance at the crossing")
-    offered = flag("offered to the train; false: inside a gap, or crossed again before the balise was re-armed")
-    status = one_of(
-        PassageStatus, "what became of it; null where crossed again before the balise was re-armed", nullable=True
-    )
-
-
-class JudgedEpochs(dy.Schema):
-    """What the judge adds to the epochs of a solution, row for row (DOMAIN sections 5.2 and 5.3)."""
-
-    epoch = dy.Int64(min=0, description="row among the epochs of the solution")
-    at = instant("the instant at which the position is judged: its stamp less the latency of the vehicle file")
-    direction = dy.Int8(
-        description="direction of travel along growing path, 1 or -1; without an odometer the evidence's"
-    )
-    judgement = one_of(Judgement, "what the evidence says of the position")
-    error_low_m = real("m", "least error in the direction of travel that the evidence leaves")
-    error_high_m = real("m", "largest error in the direction of travel that the evidence leaves")
-    error_along_m = real("m", "error where reference or reads give it to `known_error_m`")
-    evidence = one_of(Evidence, "what the judgement rests on; null where nothing is known", nullable=True)
-    wrong_track = flag("judged wrong for its net element, wherever along it")
-    track_assumed = flag("right if the survey holds the train's track, which nothing shows")
-    train_m = real("m", "path position of the train where reference or reads give it to `known_error_m`")
-    reference_m = real("m", "the same where the reference gives it")
-    unambiguous = flag("the track of the position was not in doubt by what the train knew then")
-    moving = flag("the train moves from here to the next epoch; null where not known", nullable=True)
-    stood = flag("the odometer stood while positions left their place by more than the failure limit")
-    odometer_wrong = flag("the distance since the last accepted VB is beyond 5 m + 5 % by the evidence")
-    undiagnosed = flag("state P3: no verdict of `along_raw`, by the LDS, or `odometer_wrong`")
-    in_use = flag("fix valid, unambiguous, confident, not negated, not withheld")
-    used_s = real("s", "time in use that the epoch stands for", nullable=False, min=0)
-    wrong_s = real("s", "the same where it was wrong", nullable=False, min=0)
-    natural_s = real("s", "of it what no injected fault of GNSS explains", nullable=False, min=0)
-    counted_s = real("s", "time that the epoch stands for in shares of time", nullable=False, min=0)
-    lds_state = one_of(
-        LdsState, "state of the reactive LDS; null where it needs a truth that is missing", nullable=True
-    )
-
-
-class JudgedOffers(dy.Schema):
-    """One row per crossing of a virtual balise or telegram, judged against where the train was; joined by its id."""
-
-    crossing_id = dy.Int64(min=0, description="as in `Crossings`")
-    balise_id = text("balise")
-    t = instant("the crossing, interpolated")
-    epoch = dy.Int64(min=0, description="row of the first epoch at or after the crossing")
-    path_m = real("m", "path position of the balise", nullable=False)
-    virtual = flag("a virtual balise; else a telegram")
-    accepted = flag("a virtual balise that the LDS accepted")
-    offered = flag("a virtual balise offered; false where crossed again before it was re-armed, which only a jump does")
-    beyond_window = flag("offered after its window closed")
-    location_error_m = real("m", "error where reference or reads give it to `known_error_m`")
-    judgement = one_of(Judgement, "what the evidence says of the offer")
-    error_low_m = real("m", "least error in the direction of travel that the evidence leaves")
-    error_high_m = real("m", "largest error in the direction of travel that the evidence leaves")
-    evidence = one_of(Evidence, "what the judgement rests on; null where nothing is known", nullable=True)
-    wrong_track = flag("judged wrong for its net element, wherever along it")
-    track_assumed = flag("right if the survey holds the train's track, which nothing shows")
-    proof_margin_m = real("m", "by how much the evidence may be wrong before what is right is no longer", min=0)
-
-
-class Failures(dy.Schema):
-    """One row per failure: judged wrong in use, over pulses, whether it crosses a VB or not (DOMAIN section 5.3)."""
-
-    t_start = instant("first position that may belong to it")
-    t_end = instant("first position that no longer does")
-    hazardous_s = real("s", "time judged wrong in use, over the whole failure", nullable=False, min=0)
-    natural_s = real("s", "of it what no injected fault of GNSS explains", nullable=False, min=0)
-    hazardous_may_s = real("s", "the same with the time that is unknown", nullable=False, min=0)
-    accepted = one_of(Judgement, "worst judgement of the virtual balises accepted in it; right where none was")
-    within_budget = flag("hazardous time within the budget; null where it cannot be said", nullable=True)
+    def accepted(self) -> Bools:
+        """Virtual balises that the LDS accepted."""
+        return np.asarray(self.virtual & (self.status == tuple(PassageStatus).index(PassageStatus.ACCEPTED)))

@@ -270,6 +270,7 @@ class _EpochsAfterMonitors(dy.Schema):
 
 
 def _monitor_columns(monitor: Monitor) -> dict[str, dy.Column]:
+    """Columns of one monitor."""
     name, unit = monitor.name, monitor.unit
     return {
         f"{name}_value": real(unit, f"statistic of the monitor `{name}`"),
@@ -280,6 +281,7 @@ def _monitor_columns(monitor: Monitor) -> dict[str, dy.Column]:
 
 
 def _epochs_schema() -> type[dy.Schema]:
+    """Columns of the epochs, with those of all monitors."""
     columns: dict[str, Any] = dict(_EpochsBeforeMonitors.columns())
     for monitor in ALL_MONITORS:
         columns |= _monitor_columns(monitor)

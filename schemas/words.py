@@ -15,7 +15,7 @@ from importlib.resources import files
 from string import Formatter
 from typing import Any, TypeVar
 
-from schemas.enums import LostTo, MisfitCause, MisfitPlace, Note, NotShown, Reason, Remedy, RunVerdict
+from schemas.enums import Evidence, LostTo, MisfitCause, MisfitPlace, Note, NotShown, Reason, Remedy, RunVerdict
 from schemas.frozen import frozen
 
 Code = TypeVar("Code", bound=StrEnum)
@@ -31,7 +31,17 @@ WORDS: dict[str, Any] = tomllib.loads((files("schemas") / "words.toml").read_tex
 
 
 def say(section: str, name: str, /, *figures: object, **named: object) -> str:
-    """The words of a section under a name, with their figures: `say("hazards", "in_use", 3.0, 0.5)`."""
+    """The words of a section under a name, with their figures: `say("hazards", "in_use", 3.0, 0.5)`.
+
+    Args:
+        section: section of `words.toml`.
+        name: key in it.
+        figures: by place.
+        named: figures by name.
+
+    Returns:
+        The sentence.
+    """
     return str(WORDS[section][name]).format(*figures, **named)
 
 
@@ -42,6 +52,14 @@ def say_of(section: str, name: str, figures: Mapping[str, object]) -> str:
     """The words of a section with figures by name; a part in [brackets] stands only where its first figure does.
 
     A figure stands where it is neither null nor zero.
+
+    Args:
+        section: section of `words.toml`.
+        name: key in it.
+        figures: by name.
+
+    Returns:
+        The sentence.
     """
 
     def part(match: re.Match[str]) -> str:
@@ -62,6 +80,7 @@ MISFIT_PLACES = _sentences(MisfitPlace, "misfit_places")
 LOST = _sentences(LostTo, "lost")
 NOT_SHOWN = _sentences(NotShown, "not_shown")
 REMEDIES = _sentences(Remedy, "remedies")
+JUDGES: Mapping[str, str] = {kind.value: words for kind, words in _sentences(Evidence, "judges").items()}
 
 
 @frozen
@@ -73,21 +92,43 @@ class Remark:
 
     @property
     def words(self) -> str:
+        """The note as a sentence."""
         return NOTES[self.note].format(*self.figures)
 
 
 def remarks(noted: Mapping[Note, object]) -> list[Remark]:
-    """The notes of what there is: falsy means that there is nothing to say; a tuple holds several figures."""
+    """The notes of what there is.
+
+    Args:
+        noted: figures by note; falsy means that there is nothing to say, a tuple holds several figures.
+
+    Returns:
+        What there is to say, in the order given.
+    """
     return [Remark(note, value if isinstance(value, tuple) else (value,)) for note, value in noted.items() if value]
 
 
 def notes_text(noted: Iterable[Remark]) -> str | None:
-    """All notes as they stand in `runs.notes`."""
+    """All notes as they stand in `runs.notes`.
+
+    Args:
+        noted: what there is to say.
+
+    Returns:
+        One text, or None for nothing.
+    """
     return BETWEEN.join(remark.words.replace(BETWEEN, ", ") for remark in noted) or None
 
 
 def notes_apart(notes: str | None) -> list[str]:
-    """The same one by one, to show each on a line of its own."""
+    """The same one by one, to show each on a line of its own.
+
+    Args:
+        notes: `runs.notes`.
+
+    Returns:
+        One text per note.
+    """
     return notes.split(BETWEEN) if notes else []
 
 
@@ -96,12 +137,19 @@ def lost_words(
 ) -> str:
     """What moving time was lost to, the largest first: `82 % alarms (mostly along_raw), 3 % no odometer`.
 
-    `lost_share`: of all that was lost; what none of the causes explains is named last.
+    Args:
+        lost_to: causes of the losses, the largest first.
+        shares: of the moving time, one per cause [1].
+        monitor: the monitor that gave most alarms.
+        lost_share: of all that was lost [1]; what none of the causes explains is named last.
+
+    Returns:
+        The words, empty without losses.
     """
     losses = list(zip(lost_to or (), shares or (), strict=True))
-    beside = {LostTo.ALARM: f" (mostly {monitor})"} if monitor else {}
+    details = {LostTo.ALARM: f" (mostly {monitor})"} if monitor else {}
     named = [
-        f"{share:.0%} {LOST[LostTo(cause)]}{beside.get(LostTo(cause), '')}"
+        f"{share:.0%} {LOST[LostTo(cause)]}{details.get(LostTo(cause), '')}"
         for cause, share in losses[:_NAMED]
         if share >= _LEAST_SHARE
     ]
@@ -110,32 +158,44 @@ def lost_words(
 
 
 def reason_words(run: Mapping[str, Any]) -> str:
-    """Why a `runs` row has its verdict, one reason after the other, with its figures."""
+    """Why a `runs` row has its verdict, one reason after the other, with its figures.
+
+    Args:
+        run: a `runs` row.
+
+    Returns:
+        Reasons with their figures, separated by semicolons.
+    """
     undecided = run["failures"] - run["failures_within_budget"] - run["failures_beyond_budget"]
-    figures = {
-        **{name: run[name] for name in ("unsafe_accepted", "unproven_accepted", "failures_beyond_budget")},
-        "failures_undecided": undecided,
-        **{name: f"{run[name] or 0.0:.3g}" for name in ("hazardous_natural_s", "unknown_in_use_s")},
-        "share_undiagnosed": f"{run['share_undiagnosed'] or 0.0:.1%}",
-    }
-    reasons = [REASONS[Reason(reason)].format(**figures) for reason in run["reasons"] or ()]
+    figures = {name: 0 if value is None else value for name, value in run.items()} | {"failures_undecided": undecided}
+    reasons = [REASONS[Reason(reason)].format_map(figures) for reason in run["reasons"] or ()]
     return "; ".join(reasons) or say("reasons", "none")
 
 
 def part_words(run: Mapping[str, Any]) -> str:
     """`safe from 12:00:03 to 12:41:50, 92% of the moving time`: the verdict between first and last anchor, where it is
     another than the run's.
+
+    Args:
+        run: a `runs` row.
+
+    Returns:
+        The words, or nothing.
     """
     if run["part_verdict"] in (None, run["verdict"]):
         return ""
     return say("verdicts", "part", *(run[f"part_{name}"] for name in ("verdict", "from", "to", "share")))
 
 
-def beside_words(run: Mapping[str, Any]) -> str:
-    """What stands beside every verdict: balises accepted of those on the path, availability, proof margin; and beside
-    a safe one what it rests on by declaration alone.
+def verdict_figures_words(run: Mapping[str, Any]) -> str:
+    """What is said next to every verdict: balises accepted of those on the path, availability, proof margin; and next
+    to a safe one what it rests on by declaration alone.
 
-    `run`: a `runs` row, or figures of several runs with `odometer_origins`, those of the safe ones.
+    Args:
+        run: a `runs` row, or figures of several runs with `odometer_origins`, those of the safe ones.
+
+    Returns:
+        The words, separated by commas.
     """
     share, margin_m = run["availability"], run["proof_margin_m"]
     once, times = accepted_words(run)
@@ -146,7 +206,14 @@ def beside_words(run: Mapping[str, Any]) -> str:
 
 
 def accepted_words(run: Mapping[str, Any]) -> tuple[str, str]:
-    """`7 of 9`: balises accepted of those passed, each once; and how often, where that is not the same."""
+    """`7 of 9`: balises accepted of those passed, each once; and how often, where that is not the same.
+
+    Args:
+        run: a `runs` row, or figures of several runs.
+
+    Returns:
+        `7 of 9`, and how often or nothing.
+    """
     once = run["balises_found"], run["balises_passed"]
     times = run["balises_accepted"], run["balises_on_path"]
     return say("verdicts", "of", *once), say("verdicts", "times", *times) if times != once else ""
@@ -160,9 +227,14 @@ def _provided(run: Mapping[str, Any]) -> list[str]:
 
 
 def unnoticed_words(largest_m: float | None, beyond_share: float | None = None) -> str:
-    """How large an error may stay unnoticed; `largest_m`: the largest while in use, where it was computed.
+    """How large an error may stay unnoticed.
 
-    `beyond_share`: of the epochs in use, with one beyond the failure limit.
+    Args:
+        largest_m: the largest unnoticed error while in use [m]; None where it was not computed.
+        beyond_share: of the epochs in use, with one beyond the failure limit [1].
+
+    Returns:
+        The words.
     """
     if largest_m is None:
         return say("verdicts", "unnoticed_not_known")
@@ -174,8 +246,14 @@ def unnoticed_words(largest_m: float | None, beyond_share: float | None = None) 
 def remedy_words(remedy: Remedy | str, gain: float = 0.0, **places: str) -> str:
     """What would mend it, how, and which share of the moving time that would win back or prove at most.
 
-    `places`: paths known where it is shown, with `project` the keys of that file in place of a command. Without any, in
-    words for readers inside and outside a project.
+    Args:
+        remedy: what would help.
+        gain: share of the moving time that it would win back or prove at most [1].
+        places: paths known where it is shown (`run`, `site`, `out`, `config`, `project`); with `project` the keys of
+            that file stand in place of a command, without any words for readers inside and outside a project.
+
+    Returns:
+        The sentence.
     """
     section = "remedies_of_project" if "project" in places else "remedies_by_command" if places else "remedies_anywhere"
     how = WORDS[section].get(Remedy(remedy).value, "")

@@ -5,11 +5,15 @@ from __future__ import annotations
 import contextlib
 import fcntl
 import gc
+import hashlib
+import multiprocessing
 import os
 import pickle
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
+from multiprocessing.context import ForkServerContext, ForkServerProcess
 from pathlib import Path
+from typing import Any
 
 import polars as pl
 import pytest
@@ -17,7 +21,7 @@ from hypothesis import HealthCheck, settings
 
 from datasets.demo import demo_scenario
 from datasets.trial import build_run, build_site, write_run_log, write_site
-from schemas.run import RunLog
+from schemas.run import RunLog, RunTables
 
 # The same examples every time, on a slow machine too.
 settings.register_profile(
@@ -31,6 +35,17 @@ gc.disable()
 _GARBAGE_AFTER = 50_000
 
 _LENGTH_S = 40
+
+# What a worker needs of the program. None of it starts threads of its own that a forked process would miss.
+_LOADED = (
+    "pipeline.campaign.worker",
+    "pipeline.one_run",
+    "pipeline.read.ingest.run",
+    "pipeline.show.report.write",
+)
+
+# Tables of replays by what was asked: run, site, vehicle and configuration, with all that is in them.
+_REPLAYED: dict[bytes, RunTables] = {}
 
 # Not part of `make quick`: tests that start processes, draw many random numbers, or replay one journey after the other.
 _SLOW = (
@@ -82,7 +97,7 @@ _SLOW = (
 _QUICK = (
     "campaign/test_plan.py",
     "experiment/test_constellation.py",
-    "experiment/test_ranges.py",
+    "experiment/test_rare_recorded.py",
     "show/export/test_gis.py",
     "show/export/test_places.py",
     "studies/line/test_replayed.py",
@@ -137,6 +152,47 @@ def work_here(patch: pytest.MonkeyPatch) -> None:
     patch.setattr(os, "cpu_count", lambda: 1)
     patch.setattr(run, "_engine_for", lambda jobs, runs, scheduler, limit_s: SerialEngine(limit_s))
     patch.setattr(workers, "ProcessPoolExecutor", lambda count, mp_context: contextlib.nullcontext(_Here()))
+
+
+@pytest.fixture
+def replayed_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    """What a log comes to is worked out once in this process: for tests of what is around a replay, not of replays."""
+    from pipeline import one_run
+
+    monkeypatch.setattr(one_run, "replay", _remembered(one_run.replay))
+
+
+def _remembered(replay: Callable[..., RunTables]) -> Callable[..., RunTables]:
+
+    def once(*asked: object) -> RunTables:
+        key = hashlib.sha256(pickle.dumps(asked)).digest()
+        if key not in _REPLAYED:
+            _REPLAYED[key] = replay(*asked)
+        return _REPLAYED[key]
+
+    return once
+
+
+@pytest.fixture
+def forked_workers(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Workers are forked from one process that has loaded the program: for tests of what becomes of them later.
+
+    How they start on this machine is the subject of `campaign/test_local.py` and `campaign/test_interruptions.py`.
+    """
+    multiprocessing.set_forkserver_preload(list(_LOADED))
+    monkeypatch.setattr("pipeline.campaign.engines._KnownProcesses", _Forked)
+    monkeypatch.setattr("pipeline.results.workers.get_context", lambda _: multiprocessing.get_context("forkserver"))
+
+
+class _Forked(ForkServerContext):
+    """As `engines._KnownProcesses`."""
+
+    def __init__(self) -> None:
+        self.made: list[ForkServerProcess] = []
+
+    def Process(self, *args: Any, **kwargs: Any) -> ForkServerProcess:  # type: ignore[override]  # noqa: N802
+        self.made.append(ForkServerProcess(*args, **kwargs))
+        return self.made[-1]
 
 
 class _Here:

@@ -10,11 +10,12 @@ from pipeline.stages.epochs.verdicts import Verdicts
 from pipeline.stages.monitors.bank import MonitorBank
 from schemas.config import Configuration
 from schemas.stages import AlignedEpochs
+from tests.arrays_of_table import arrays_of_table
 
 
 def bank_over(table: pl.DataFrame, singles: Mapping[str, Verdicts], config: Configuration) -> MonitorBank:
     """The bank over a table of aligned epochs."""
-    return MonitorBank(AlignedEpochs.of_table(table), singles, config)
+    return MonitorBank(arrays_of_table(AlignedEpochs, table), singles, config)
 
 
 def verdict_table(verdicts: Verdicts) -> pl.DataFrame:

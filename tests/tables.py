@@ -6,9 +6,9 @@ import dataframely as dy
 import numpy as np
 import polars as pl
 
+from pipeline.stages.judge.failures import Failure
 from schemas.conform import conform
-from schemas.enums import Origin
-from schemas.stages import Failures
+from schemas.enums import Judgement, Origin
 from schemas.tables import Alarms, Epochs, Hazards, Passages
 
 _DEFAULTS: dict[type, Any] = {dy.Bool: False, dy.String: "x", dy.List: [], dy.Int64: 0, dy.Float64: 0.0}
@@ -91,11 +91,16 @@ def alarms(height: int = 0, **columns: Any) -> pl.DataFrame:
     return table(Alarms, height, **columns)
 
 
-def failures(height: int = 0, **columns: Any) -> pl.DataFrame:
+def failures(height: int = 0, **columns: Any) -> list[Failure]:
+    """Failures of a position each, with these values or lists of them."""
     plain: dict[str, Any] = {
         "hazardous_s": 0.0,
         "natural_s": columns.get("hazardous_s", 0.0),
         "hazardous_may_s": columns.get("hazardous_s", 0.0),
-        "accepted": "right",
+        "accepted": Judgement.RIGHT,
+        "within_budget": None,
     }
-    return table(Failures, height, **(plain | columns))
+    each = {name: _each(value, height) for name, value in (plain | columns).items()}
+    return [
+        Failure(row, row, row, row + 1, **{name: values[row] for name, values in each.items()}) for row in range(height)
+    ]

@@ -19,7 +19,6 @@ from pathlib import Path
 
 import numpy as np
 import polars as pl
-from scipy.stats import beta
 
 from benchmarks.results import Figure
 from pipeline.stages.matching import match
@@ -293,6 +292,8 @@ def figures(families: dict[str, list[Claim]]) -> list[Figure]:
 
 def least_share(wrongs: int, count: int) -> float:
     """Lower end of the exact two-sided 95 % interval (Clopper and Pearson)."""
+    from scipy.stats import beta  # takes long to load
+
     return float(beta.ppf(0.025, wrongs, count - wrongs + 1)) if wrongs else 0.0
 
 

@@ -21,7 +21,6 @@ import numpy as np
 import numpy.typing as npt
 import polars as pl
 from scipy.ndimage import uniform_filter1d
-from scipy.signal import lfilter
 
 from benchmarks.results import Figure, processor_s
 from pipeline.stages.follows import Follows, follows_positions
@@ -74,6 +73,8 @@ def journey(rng: Rng, length_s: float) -> Journey:
 
 def _correlated(rng: Rng, size: int, tau: float, step: float) -> Floats:
     """First-order Gauss-Markov noise of unit variance."""
+    from scipy.signal import lfilter  # takes long to load
+
     phi = np.exp(-step / tau)
     drive = rng.standard_normal(size)
     drive[1:] *= np.sqrt(1.0 - phi**2)

@@ -19,11 +19,11 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 import polars as pl
-from scipy.signal import lfilter
 
 from pipeline.stages.monitors.bank import MonitorBank
 from schemas.config import Configuration
 from schemas.stages import AlignedEpochs
+from tests.arrays_of_table import arrays_of_table
 
 Floats = npt.NDArray[np.float64]
 _AXES = ("along", "cross", "up")
@@ -66,6 +66,8 @@ def _stamps(receiver: Receiver, hours: float, rng: np.random.Generator) -> Float
 
 def _gauss_markov(t_s: Floats, tau_s: float, rng: np.random.Generator) -> Floats:
     """Unit variance; on the regular grid of the rate, then read at the stamps."""
+    from scipy.signal import lfilter  # takes long to load
+
     step_s = float(np.min(np.diff(t_s)))
     grid = np.round(t_s / step_s).astype(np.int64)
     phi = np.exp(-step_s / tau_s)
@@ -147,7 +149,7 @@ def epochs_of(
 
 def first_alarm(epochs: pl.DataFrame, config: Configuration, after_s: float = 60.0) -> tuple[str, float] | None:
     """Monitor and time of the first fail after so long, None where there is none."""
-    columns = pl.DataFrame(MonitorBank(AlignedEpochs.of_table(epochs), {}, config).columns())
+    columns = pl.DataFrame(MonitorBank(arrays_of_table(AlignedEpochs, epochs), {}, config).columns())
     t_s = epochs["t"].dt.timestamp("ns").to_numpy() * 1e-9
     found = []
     for name in (f"{axis}_{scale}" for axis in _AXES for scale in _SCALES):
@@ -193,7 +195,7 @@ def ramps(count: int, seed: int) -> None:
 def _given_noise(receiver: Receiver, rng: np.random.Generator) -> Configuration:
     """As calibration measures it, on another run of the receiver."""
     unhedged = Configuration.model_validate({"monitors": {"noise_doubt": 0.0}})
-    shown = MonitorBank(AlignedEpochs.of_table(epochs_of(receiver, 2.0, rng)), {}, unhedged).median_noise_m()
+    shown = MonitorBank(arrays_of_table(AlignedEpochs, epochs_of(receiver, 2.0, rng)), {}, unhedged).median_noise_m()
     return Configuration.model_validate({"monitors": shown})
 
 
@@ -202,7 +204,7 @@ def _delay_s(epochs: pl.DataFrame, config: Configuration) -> float:
     found = first_alarm(epochs, config, _ONSET_S)
     if found is not None:
         return found[1] - _ONSET_S
-    bank = MonitorBank(AlignedEpochs.of_table(epochs), {}, config)
+    bank = MonitorBank(arrays_of_table(AlignedEpochs, epochs), {}, config)
     return np.inf if bank.noise_known_at(epochs.height - 1) else np.nan
 
 

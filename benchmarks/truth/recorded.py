@@ -13,11 +13,9 @@ from pathlib import Path
 
 from benchmarks.results import Figure, stopwatch
 from benchmarks.trials import line_scenario
-from datasets.experiment.recorded.baseline import Baseline, baseline_of
+from datasets.experiment.recorded.baseline import Baseline, Onset, baseline_of, numbered, onsets_of, room_of
 from datasets.experiment.recorded.command import recorded_experiment
-from datasets.experiment.recorded.draw import Onset, numbered, onsets_of, room_of
-from datasets.experiment.recorded.injection import injected
-from datasets.experiment.recorded.outcome import outcome_row
+from datasets.experiment.recorded.outcome import injected, outcome_row
 from datasets.experiment.recorded.plan import Bank, PlannedFault, RecordedPlan, load_plan
 from datasets.faults import FaultKind, FaultSpec
 from datasets.inject import inject

@@ -127,8 +127,8 @@ def outcome(made: Journey, config: Configuration) -> Outcome:
     aligned, lds = lds_of(made, config)
     path_m = aligned.path_m
     error_m = np.abs(path_m - made.true_m - np.median(path_m[:300] - made.true_m[:300]))
-    negated = lds.epochs["negated"].to_numpy()
-    withheld = lds.epochs["withheld"].to_numpy()
+    negated = lds.epochs.negated
+    withheld = lds.epochs.withheld
     in_use = ~negated & ~withheld & (aligned.confidence_m <= config.lds.ci_limit_m)
     returns = np.flatnonzero(negated[:-1] & ~negated[1:]) + 1
     after = np.arange(path_m.size) >= (returns[0] if returns.size else path_m.size)
@@ -140,7 +140,7 @@ def unused_s(made: Journey, config: Configuration) -> float:
     """For how long the position of a sound journey is out of use from 1,000 s on, when its event is over [s]."""
     aligned, lds = lds_of(made, config)
     t_s = (aligned.t_ns - aligned.t_ns[0]) // NS_PER_S
-    unused = lds.epochs["negated"].to_numpy() | lds.epochs["withheld"].to_numpy()
+    unused = lds.epochs.negated | lds.epochs.withheld
     return float((unused & (t_s >= 1_000.0)).sum())
 
 

@@ -16,7 +16,6 @@ from pathlib import Path
 
 import numpy as np
 import polars as pl
-from scipy.signal import lfilter
 
 from benchmarks.results import Figure
 from benchmarks.truth.calibration import degrees, fixes_at, noise, odometer_at
@@ -234,6 +233,8 @@ class Known:
 
 def known_by_reference(family: str, seed: int) -> Known:
     """One world by chance, and a reference that states its sigma, 0.05 to 0.5 m, correlated over 10 to 60 s."""
+    from scipy.signal import lfilter  # takes long to load
+
     rng = np.random.default_rng([seed, list(FAMILIES).index(family), 1])
     world = FAMILIES[family](rng)
     survey_m = float(rng.choice([0.1, 0.3, 0.5, 1.0]))

@@ -16,9 +16,9 @@ import numpy as np
 import polars as pl
 from scipy.special import chdtri
 
+from datasets.experiment.bank import BankSpec, linear_bank
 from datasets.experiment.geometry import TAUS_S, Constellation, Geometry, default_geometry
-from datasets.experiment.linear_bank import BankSpec, linear_bank
-from datasets.experiment.rare import missed_detection_probability
+from datasets.experiment.sampling import missed_detection_probability
 from pipeline.show.terminal import show_table
 from pipeline.stages.monitors.axis import AxisSeries, ewma_weight, run_axis
 from pipeline.stages.monitors.pseudorange import clock_columns, line_of_sight_rows
@@ -93,7 +93,7 @@ def watched_of(offset_m: Floats, sigmas_m: Floats, alphas: Floats) -> Watched:
         fresh=fresh,
         free=series.border,
         fastest_m=5.0 * second,
-        way_s=second,
+        gain_s=second,
         rate_mps=series.rate_mps,
         least_mps=np.maximum(-limit[:, 0], series.rate_mps - 5.0),
         most_mps=np.minimum(limit[:, 0], series.rate_mps + 5.0),

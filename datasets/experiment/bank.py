@@ -1,201 +1,271 @@
-"""Which bank to use: detection, false alarms and budget of candidate banks over a catalogue of faults.
+"""The bank of monitors as one linear Gaussian system: its thresholds, its covariances, and how it answers a ramp.
 
-Banks are compared on the same sky and with the replay's own rules: what counts is not the time to detect but
-whether the fault is negated within the allowed time after the failure (TVB eq. 7), and how often a healthy train
-is disturbed for it.
+State: Gauss-Markov errors by source and axis, white noise on positions (a Gauss-Markov error without memory),
+then the monitors. With s(k+1) = A s(k) + B w(k+1) and w standard normal, every covariance between monitors at any
+two epochs follows from powers of A.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import replace
-from functools import partial
+from collections.abc import Callable
+from dataclasses import field
+from functools import cached_property, partial
+from typing import ClassVar, Literal
 
 import numpy as np
-import polars as pl
+from scipy.linalg import solve_discrete_lyapunov
+from scipy.special import log_ndtr, ndtri_exp
 
-from datasets.experiment.bank_faults import CATALOGUE, HEADING_DEG, Fault, WhiteNoise, failure_s, fault_response
-from datasets.experiment.geometry import default_geometry
-from datasets.experiment.linear_bank import BankSpec, LinearBank, linear_bank
-from datasets.experiment.plan import SENSORS
-from datasets.experiment.rare import false_alarm_probability
-from datasets.experiment.tables import Contents, Row, share, table
-from datasets.experiment.workers import generator
-from pipeline.results.workers import mapped
-from schemas.arrays import Ints
-from schemas.config import Configuration, MonitorConfig
+from datasets.experiment.geometry import SOURCES, TAUS_S, Geometry
+from datasets.experiment.sampling import Limits, root_of
+from schemas.arrays import Bools, Floats
+from schemas.config import MonitorConfig, threshold_factor
+from schemas.frozen import frozen
 
-REPETITIONS = 200
-# So few runs in which all goes well show a share over 95 % (Clopper-Pearson, two-sided 95 %).
-FEWEST_RUNS = 72
-_LONGEST_S = 6_000.0
-_ALARM_RUNS = 200
-# Noise of a matched position against the surveyed track beyond the survey's constant error [m].
-_MAP_M = 0.1
-# A train that is stopped by its own diagnosis more often than this is not operated.
-_MOST_ALARMS_PER_H = 0.01
-_SURE = 0.95
+Reading = Literal["increments", "position"]
+Sensors = Literal["odometer", "odometer_and_track"]
+
+READINGS: tuple[Reading, ...] = ("increments", "position")
+SENSORS: tuple[Sensors, ...] = ("odometer", "odometer_and_track")
+# The two readings of the odometer's noise and the slowest average that goes with each (DOMAIN section 7).
+PUBLISHED_WEIGHTS: dict[Reading, tuple[float, ...]] = {
+    "increments": (1.0, 0.1, 0.01, 0.001),
+    "position": (1.0, 0.1, 0.01, 0.002),
+}
+_MOST_AXES = 3
 
 
-def made(repetitions: int, seed: int, jobs: int, config: Configuration | None = None) -> Contents:
-    """`comparison` by bank and fault, and `ranking`: the first is the one to use, `reason` says why.
+@frozen
+class BankSpec:
+    """A bank that a user may configure: EWMA weights at 1 s (1 = raw), sensors, probability, rate of epochs.
 
-    A configured bank enters the comparison beside the candidates.
+    Without alphas it is the bank that goes with the reading of the odometer's noise. `age_s`: how long the bank has
+    run since its restart when a fault begins; none is so long that nothing of the restart is left.
     """
-    specs = candidates()
-    if config is not None:
-        specs += [
-            replace(BankSpec.of(config.monitors, sensors, rate_hz), map_m=_MAP_M)
-            for sensors in SENSORS
-            for rate_hz in (1.0, 10.0)
-        ]
-    comparison = compare_banks(list(dict.fromkeys(specs)), repetitions=repetitions, seed=seed, jobs=jobs)
-    return {"comparison": comparison, "ranking": rank_banks(comparison)}
+
+    alphas: tuple[float, ...] = ()
+    reading: Reading = "increments"
+    sensors: Sensors = "odometer"
+    false_alarm_probability: float = 1e-7
+    rate_hz: float = 1.0
+    odometer_m: float = 0.05
+    map_m: float = 1.0
+    age_s: float | None = None
+
+    @classmethod
+    def of(cls, config: MonitorConfig, sensors: Sensors, rate_hz: float = 1.0) -> BankSpec:
+        """The bank of a replay's configuration; recorded odometers are noisy on increments."""
+        return cls(
+            alphas=(1.0, *config.ewma_alphas),
+            sensors=sensors,
+            false_alarm_probability=config.false_alarm_probability,
+            rate_hz=rate_hz,
+            odometer_m=config.odometer_sigma_mps,
+        )
+
+    @property
+    def weights(self) -> tuple[float, ...]:
+        """Of the averages at 1 s, the raw monitor's first."""
+        return self.alphas or PUBLISHED_WEIGHTS[self.reading]
+
+    @property
+    def weights_text(self) -> str:
+        """As they stand in tables."""
+        return ", ".join(f"{alpha:g}" for alpha in self.weights)
 
 
-def candidates() -> list[BankSpec]:
-    """Weights, probability, rate and sensors that a user may choose."""
-    weights = (
-        (1.0, 0.1, 0.01, 0.001),
-        (1.0, 0.1, 0.01, 0.002),
-        (1.0, 0.1, 0.01),
-        (1.0, 0.3, 0.1, 0.03, 0.01, 0.003, 0.001),
-    )
-    return [
-        BankSpec(alphas=alphas, sensors=sensors, false_alarm_probability=probability, rate_hz=rate_hz, map_m=_MAP_M)
-        for alphas in weights
-        for sensors in ("odometer", "odometer_and_track")
-        for probability, rate_hz in ((1e-7, 1.0), (1e-8, 1.0), (1e-7, 10.0), (1e-8, 10.0))
-    ]
+@frozen
+class LinearBank:
+    """Monitors along, and with track across and up, as a `System`; stationary, unless the bank has an age.
 
-
-def compare_banks(
-    specs: Sequence[BankSpec],
-    faults: tuple[Fault, ...] = CATALOGUE,
-    repetitions: int = REPETITIONS,
-    seed: int = 1,
-    jobs: int = 1,
-) -> pl.DataFrame:
-    """One row per bank and fault; GPS alone."""
-    evaluate = partial(_evaluated, faults, repetitions, seed)
-    return table([row for part in mapped(evaluate, list(enumerate(specs)), jobs) for row in part])
-
-
-def _evaluated(faults: tuple[Fault, ...], repetitions: int, seed: int, candidate: tuple[int, BankSpec]) -> list[Row]:
-    number, spec = candidate
-    bank = linear_bank(default_geometry("gps"), HEADING_DEG, spec)
-    budget_s = Configuration().budget_s
-    horizon_s = _horizon_s(faults, budget_s)
-    first, by = _first_fails(bank, faults, int(horizon_s * spec.rate_hz), repetitions, (seed, number))
-    alarms = false_alarm_probability(bank, int(600 * spec.rate_hz), _ALARM_RUNS, seed)
-    alarms_per_h = float(-np.log1p(-min(alarms.value, 1.0 - 1e-12)) * 6.0)
-    labels: Row = {
-        "bank": number,
-        "alphas": spec.weights_text,
-        "sensors": spec.sensors,
-        "probability": spec.false_alarm_probability,
-        "rate_hz": spec.rate_hz,
-    }
-    return [
-        labels | _row(bank, fault, first[index], by[index], budget_s, horizon_s) | {"false_alarms_per_h": alarms_per_h}
-        for index, fault in enumerate(faults)
-    ]
-
-
-def _horizon_s(faults: tuple[Fault, ...], budget_s: float) -> float:
-    """Until the slowest failure is over its budget, and not longer than the longest."""
-    times = [failure_s(fault, default_geometry("gps")) or 0.0 for fault in faults]
-    return min(max(times) + budget_s + 1.0, _LONGEST_S)
-
-
-def _first_fails(
-    bank: LinearBank, faults: tuple[Fault, ...], epochs: int, repetitions: int, key: tuple[int, int]
-) -> tuple[Ints, Ints]:
-    """When a monitor first fails, and the loudest one then, (faults, repetitions); -1 where none does."""
-    seed, number = key
-    rates = [fault.rates(default_geometry("gps"), bank.along_error.size) for fault in faults]
-    responses = np.stack(
-        [fault_response(bank, rate, fault.shape, epochs) for rate, fault in zip(rates, faults, strict=True)]
-    )
-    shaken = WhiteNoise(bank, faults, repetitions, generator(seed, 62, number))
-    first = np.full((len(faults), repetitions), -1)
-    by = np.full(first.shape, -1)
-    for k, noise in enumerate(bank.paths(epochs, repetitions, generator(seed, 61, number))):
-        open_faults = np.flatnonzero((first < 0).any(axis=1))
-        if open_faults.size == 0:
-            break
-        values = noise[None] + responses[open_faults, k][:, :, None] + shaken.step(open_faults)
-        ratio = np.abs(values) / bank.threshold[:, None]
-        found = (ratio.max(axis=1) > 1.0) & (first[open_faults] < 0)
-        first[open_faults] = np.where(found, k, first[open_faults])
-        by[open_faults] = np.where(found, ratio.argmax(axis=1), by[open_faults])
-    return first, by
-
-
-def _row(bank: LinearBank, fault: Fault, first: Ints, by: Ints, budget_s: float, horizon_s: float) -> Row:
-    # A fault is in the data one epoch after it began at the earliest; the negation takes one epoch more.
-    epoch_s = 1.0 / bank.spec.rate_hz
-    runs = first.size
-    seen = first >= 0
-    detected_s = np.where(seen, (first + 1) / bank.spec.rate_hz, np.inf)
-    failed_s = failure_s(fault, default_geometry("gps"))
-    # Nothing is judged of a fault that makes no failure within the horizon.
-    trials = runs if failed_s is not None and failed_s + budget_s <= horizon_s else 0
-    missed = int((detected_s > (failed_s or 0.0)).sum())
-    in_time = int((detected_s + epoch_s <= (failed_s or 0.0) + budget_s).sum())
-    return {
-        "fault": fault.name,
-        "runs": runs,
-        "detected": float(seen.mean()),
-        "time_to_detect_median_s": float(np.median(detected_s)) if seen.mean() > 0.5 else None,
-        "first_monitor": bank.names[np.bincount(by[seen]).argmax()] if seen.any() else None,
-        "failure_s": failed_s,
-        **share("pmd_at_failure", missed if trials else 0, trials),
-        **share("within_budget", in_time if trials else 0, trials),
-    }
-
-
-def rank_banks(comparison: pl.DataFrame) -> pl.DataFrame:
-    """One row per bank, best first, with what speaks for and against it.
-
-    Banks that disturb a healthy train more than once in 100 h come last; then the number of faults that are surely
-    negated in time decides (lower bound of the share over 95 %), then the number that is seen at all, then the mean
-    share, then fewer false alarms.
+    `advance` A and `noise` B as above; `sources` is the number of error states before the monitors; `slope`
+    (monitors,) final response to a range ramp of 1 m/s; `alpha` (monitors,) weight of one epoch.
     """
-    keys = ["bank", "alphas", "sensors", "probability", "rate_hz"]
-    judged = comparison.group_by(keys, maintain_order=True).agg(
-        false_alarms_per_h=pl.col("false_alarms_per_h").first(),
-        faults_judged=pl.col("within_budget").count(),
-        faults_in_time=(pl.col("within_budget_low") > _SURE).sum(),
-        faults_seen=(pl.col("detected") > 0.5).sum(),
-        share_in_time=pl.col("within_budget").mean(),
-        late=pl.col("fault").filter(pl.col("within_budget_low") <= _SURE).str.join(", "),
-        unseen=pl.col("fault").filter(pl.col("detected") < 0.5).str.join(", "),
-        runs=pl.col("runs").min(),
-    )
-    tolerable = pl.col("false_alarms_per_h") <= _MOST_ALARMS_PER_H
-    ranked = judged.with_columns(tolerable=tolerable).sort(
-        ["tolerable", "faults_in_time", "faults_seen", "share_in_time", "false_alarms_per_h", "bank"],
-        descending=[True, True, True, True, False, False],
-    )
-    reasons = [_reason(row) for row in ranked.iter_rows(named=True)]
-    default = MonitorConfig()
-    weights = ", ".join(f"{alpha:g}" for alpha in (1.0, *default.ewma_alphas))
-    is_default = (pl.col("alphas") == weights) & (pl.col("probability") == default.false_alarm_probability)
-    return ranked.with_columns(pl.Series("reason", reasons), replay_default=is_default).with_row_index("rank", offset=1)
+
+    spec: BankSpec
+    advance: Floats
+    noise: Floats
+    sources: int
+    slope: Floats
+    alpha: Floats
+    along_error: Floats = field(repr=False)
+
+    streams: ClassVar[tuple[int, int]] = (31, 32)
+    margins: ClassVar[tuple[float, ...]] = (0.4, 1.0, 1.5, 2.0, 2.5)
+    runs_per_block: ClassVar[int] = 250
+
+    @property
+    def size(self) -> int:
+        return int(self.slope.size)
+
+    @cached_property
+    def covariance(self) -> Floats:
+        """Stationary covariance P of the state: P = A P A' + B B'."""
+        result: Floats = solve_discrete_lyapunov(self.advance, self.noise @ self.noise.T)
+        return 0.5 * (result + result.T)
+
+    @property
+    def sigma(self) -> Floats:
+        """Of each monitor, long after the restart [m/s]."""
+        return np.asarray(np.sqrt(np.diag(self.covariance)[self.sources :]))
+
+    @property
+    def threshold(self) -> Floats:
+        """k_T sigma (DIAG eq. 17), long after the restart [m/s]."""
+        return threshold_factor(self.spec.false_alarm_probability) * self.sigma
+
+    def covariances(self, epochs: int) -> Floats:
+        """Covariance of the state at epochs 0 .. n of the fault, (epochs + 1, states, states)."""
+        states = len(self.advance)
+        if self.spec.age_s is None:
+            return np.broadcast_to(self.covariance, (epochs + 1, states, states))
+        pushed = self.noise @ self.noise.T
+        current = np.zeros((states, states))
+        # At a restart the position errors go on as they were, and the averages begin at zero.
+        current[: self.sources, : self.sources] = self.covariance[: self.sources, : self.sources]
+        result = np.empty((epochs + 1, states, states))
+        age = round(self.spec.age_s * self.spec.rate_hz)
+        for k in range(age + epochs + 1):
+            if k >= age:
+                result[k - age] = current
+            current = self.advance @ current @ self.advance.T + pushed
+        return result
+
+    def sigmas(self, epochs: int) -> Floats:
+        """Of each monitor at epochs 1 .. n of the fault [m/s], (epochs, monitors)."""
+        variances = np.diagonal(self.covariances(epochs)[1:], axis1=1, axis2=2)
+        return np.asarray(np.sqrt(variances[:, self.sources :]))
+
+    def thresholds(self, epochs: int) -> Floats:
+        """k_T sigma at epochs 1 .. n of the fault [m/s], (epochs, monitors)."""
+        return threshold_factor(self.spec.false_alarm_probability) * self.sigmas(epochs)
+
+    def ramp(self, epochs: int, rate_mps: float) -> Floats:
+        """An average answers a range ramp that starts at epoch 0 with 1 - (1 - alpha)^k of its final value."""
+        k = np.arange(1, epochs + 1)[:, None]
+        return rate_mps * np.asarray((1.0 - (1.0 - self.alpha) ** k) * self.slope)
+
+    def limits(self, epochs: int, rate_mps: float) -> Limits:
+        towards = np.where(self.slope < 0, -1.0, 1.0)
+        return Limits(self.ramp(epochs, rate_mps), self.thresholds(epochs), self.sigmas(epochs), towards)
+
+    def on_limits(self, values: Floats) -> Floats:
+        return values
+
+    def towards_limit(self, epochs: int) -> Callable[[int, int], Floats]:
+        return partial(self.covariance_with, covariances=self.covariances(epochs))
+
+    def passing(self, epochs: int) -> Callable[[int, Floats], Bools]:
+        threshold = self.thresholds(epochs)
+        return lambda k, values: np.asarray((np.abs(values) <= threshold[k][:, None]).all(axis=0))
+
+    def covariance_with(self, monitor: int, epoch: int, covariances: Floats) -> Floats:
+        """Covariance of all monitors at epochs 1 .. n with one monitor at one epoch (1-based), (epochs, monitors).
+
+        `covariances` (n + 1, states, states): those of the state, as above.
+        """
+        P = covariances
+        A = self.advance
+        epochs = len(covariances) - 1
+        result = np.empty((epochs, self.size))
+        place = self.sources + monitor
+        later = P[epoch, :, place].copy()
+        for k in range(epoch, epochs + 1):
+            result[k - 1] = later[self.sources :]
+            later = A @ later
+        earlier = np.zeros(len(A))
+        earlier[place] = 1.0
+        for k in range(epoch, 0, -1):
+            result[k - 1] = (P[k] @ earlier)[self.sources :]
+            earlier = A.T @ earlier
+        return result
+
+    def by_lag(self, epochs: int) -> Floats:
+        if self.spec.age_s is not None:
+            raise ValueError("false alarms are sampled of a stationary bank")
+        result = np.empty((2 * epochs - 1, self.size, self.size))
+        later = self.covariance[:, self.sources :].copy()
+        for lag in range(epochs):
+            result[epochs - 1 + lag] = later[self.sources :].T
+            result[epochs - 1 - lag] = later[self.sources :]
+            later = self.advance @ later
+        return result
+
+    def forced(self, values: Floats, rng: np.random.Generator) -> tuple[Floats, float]:
+        """A monitor drawn at random beyond its threshold; the tail in logarithms does not underflow at 1e-15."""
+        runs = len(values)
+        sigma = self.sigma
+        monitor = rng.integers(0, self.size, runs)
+        log_tail = float(log_ndtr(-self.threshold[0] / sigma[0]))
+        target = -ndtri_exp(log_tail + np.log(rng.random(runs))) * sigma[monitor]
+        target *= rng.choice([-1.0, 1.0], runs)
+        each = np.arange(runs)
+        pull = np.zeros((runs, self.size))
+        pull[each, monitor] = (target - values[each, monitor]) / sigma[monitor] ** 2
+        return pull, self.size * 2.0 * float(np.exp(log_tail))
+
+    def fails(self, path: Floats) -> int:
+        return int((np.abs(path) > self.threshold).sum())
+
+    def start(self, runs: int, rng: np.random.Generator) -> Floats:
+        return np.asarray(root_of(self.covariances(0)[0]) @ rng.standard_normal((len(self.advance), runs)))
+
+    def following(self, state: Floats, rng: np.random.Generator) -> Floats:
+        following = self.advance @ state
+        following += self.noise @ rng.standard_normal((self.noise.shape[1], state.shape[1]))
+        return np.asarray(following)
+
+    def values(self, state: Floats) -> Floats:
+        return state[self.sources :]
 
 
-def _reason(row: dict[str, object]) -> str:
-    """The verdict in words."""
-    alarms = float(row["false_alarms_per_h"])  # type: ignore[arg-type]
-    text = f"{row['faults_in_time']} of {row['faults_judged']} faults negated in time"
-    text += f", one false alarm in {1.0 / alarms:.0f} h" if alarms > 0 else ""
-    if int(row["runs"]) < FEWEST_RUNS:  # type: ignore[call-overload]
-        text += f" ({row['runs']} runs cannot show 95 %, {FEWEST_RUNS} can)"
-    if not row["tolerable"]:
-        text += ", which is more often than one in 100 h"
-    if row["late"]:
-        text += f"; late: {row['late']}"
-    if row["unseen"]:
-        text += f"; mostly not seen at all: {row['unseen']}"
-    return text
+def linear_bank(geometry: Geometry, heading_deg: float, spec: BankSpec) -> LinearBank:
+    """The monitors of a fixed sky and heading (DIAG eq. 1-16); the fault is a ramp in the range of one satellite.
+
+    `heading_deg`: clockwise from the faulty satellite on.
+    """
+    vectors = geometry.axes(heading_deg)[: _MOST_AXES if spec.sensors == "odometer_and_track" else 1]
+    covariances = np.einsum("ai,jik,bk->jab", vectors, geometry.source_covariances_m2, vectors)
+    dt_s = 1.0 / spec.rate_hz
+    return _assemble(spec, covariances, np.exp(-dt_s / TAUS_S), vectors @ geometry.ramp_direction)
+
+
+def bank_of_axis(spec: BankSpec, variances_m2: Floats, taus_s: Floats, white_m: float) -> LinearBank:
+    """The monitors of one axis, along the track if not said otherwise; the fault is a ramp of the position along it.
+
+    `variances_m2`, `taus_s` (sources,): Gauss-Markov errors in the order of `SOURCES`. `white_m`: white noise on
+    position.
+    """
+    covariances = variances_m2[:, None, None]
+    return _assemble(spec, covariances, np.exp(-1.0 / spec.rate_hz / taus_s), np.ones(1), white_m)
+
+
+def _assemble(spec: BankSpec, covariances: Floats, phi: Floats, slope: Floats, white_m: float = 0.0) -> LinearBank:
+    """`covariances` (sources, axes, axes) [m2] of the position; `phi` (sources,) correlation of successive epochs."""
+    count = slope.size
+    gauss_markov = len(SOURCES) * count
+    position_white = np.full(count, spec.map_m)
+    position_white[0] = np.hypot(white_m, spec.odometer_m) if spec.reading == "position" else white_m
+    sources = gauss_markov + count
+    alphas = 1.0 - (1.0 - np.array(spec.weights)) ** (1.0 / spec.rate_hz)
+    alpha = np.tile(alphas, count)
+    axis = np.repeat(np.arange(count), alphas.size)
+    states = sources + alpha.size
+    A = np.zeros((states, states))
+    B = np.zeros((states, sources + 1))
+    decay = np.concatenate([np.repeat(phi, count), np.zeros(count)])
+    A[:sources, :sources] = np.diag(decay)
+    colour = np.linalg.cholesky(covariances + 1e-18 * np.eye(count))
+    for j, one in enumerate(colour):
+        rows = slice(j * count, (j + 1) * count)
+        B[rows, rows] = np.sqrt(1.0 - phi[j] ** 2) * one
+    B[gauss_markov:sources, gauss_markov:sources] = np.diag(position_white)
+    # A monitor m(k+1) = (1 - alpha) m(k) + gain (e(k+1) - e(k)), e the error of its axis, summed over the sources.
+    gain = alpha * spec.rate_hz
+    lies_on = np.tile(np.arange(count), len(SOURCES) + 1)[None, :] == axis[:, None]
+    A[sources:, :sources] = gain[:, None] * lies_on * (decay - 1.0)
+    A[sources:, sources:] = np.diag(1.0 - alpha)
+    B[sources:, :sources] = gain[:, None] * (lies_on @ B[:sources, :sources])
+    if spec.reading == "increments":
+        B[sources:, sources] = np.where(axis == 0, gain * spec.odometer_m / np.sqrt(spec.rate_hz), 0.0)
+    return LinearBank(spec, A, B, sources, slope[axis], alpha, slope)

@@ -14,9 +14,16 @@ from functools import partial
 import numpy as np
 import polars as pl
 
-from datasets.experiment.geometry import CONSTELLATIONS, Geometry, default_geometry
-from datasets.experiment.passage import NEVER, FirstPassages, concat_passages, first_passages
-from datasets.experiment.plan import ExperimentPlan, bank_forms, failure_forms
+from datasets.experiment.figures import drawn_figures
+from datasets.experiment.geometry import CONSTELLATIONS, PLACE, Geometry, default_geometry
+from datasets.experiment.monte_carlo import (
+    NEVER,
+    ExperimentPlan,
+    FirstPassages,
+    bank_forms,
+    failure_forms,
+    first_passages,
+)
 from datasets.experiment.tables import Contents, Row, share, table, time_columns
 from datasets.experiment.workers import in_pieces
 from schemas.arrays import Bools, Ints
@@ -28,11 +35,8 @@ _BLOCK_REPETITIONS = 256
 _PMD_POINTS = 81
 
 
-def made(repetitions: int, seed: int, jobs: int, config: Configuration | None = None) -> Contents:
+def run(repetitions: int, seed: int, jobs: int, config: Configuration | None = None) -> Contents:
     """`pmd`, `detection`, `geometry` and pictures of the experiment."""
-    from datasets.experiment.figures import drawn_figures, require_matplotlib
-
-    require_matplotlib()
     frames = run_diagnostics(repetitions, seed, jobs)
     return {**frames, **drawn_figures(frames["pmd"], frames["detection"], frames["geometry"])}
 
@@ -53,15 +57,12 @@ def run_diagnostics(repetitions: int = REPETITIONS, seed: int = 1, jobs: int = 1
 
 def simulate(plans: tuple[ExperimentPlan, ...], repetitions: int, seed: int, jobs: int) -> list[FirstPassages]:
     """First passages of every plan; the same for any number of jobs."""
-    return [
-        concat_passages(in_pieces(partial(passages_of, plan), repetitions, _BLOCK_REPETITIONS, (seed, number), jobs))
-        for number, plan in enumerate(plans)
-    ]
-
-
-def passages_of(plan: ExperimentPlan, repetitions: int, rng: np.random.Generator) -> FirstPassages:
-    """First passages of the plan's own bank and failures."""
-    return first_passages(plan, bank_forms(plan), failure_forms(plan), repetitions, rng)
+    found = []
+    for number, plan in enumerate(plans):
+        passages = partial(first_passages, plan, bank_forms(plan), failure_forms(plan))
+        pieces = in_pieces(passages, repetitions, _BLOCK_REPETITIONS, (seed, number), jobs)
+        found.append(FirstPassages(*(np.concatenate(arrays, axis=-1) for arrays in zip(*pieces, strict=True))))
+    return found
 
 
 def detection_times(plan: ExperimentPlan, passages: FirstPassages) -> pl.DataFrame:
@@ -141,7 +142,7 @@ def geometry_table(geometry: Geometry) -> pl.DataFrame:
     return pl.DataFrame(
         {
             "constellation": geometry.constellation,
-            "place": geometry.place,
+            "place": PLACE,
             "t": geometry.t_ns,
             "sv": list(geometry.svs),
             "azimuth_deg": geometry.azimuth_deg,

@@ -1,138 +1,104 @@
-"""The three figures of the experiment as pictures (optional dependency matplotlib, extra `plots`)."""
+"""The published figures (DIAG Fig. 4 to 7) as SVG; that of Pmd serves the experiment on recorded runs too."""
 
 from __future__ import annotations
 
-import importlib.util
-import io
-from collections.abc import Iterator
-from math import radians
-from typing import TYPE_CHECKING
+from collections.abc import Sequence
+from itertools import product
+from math import cos, log10, radians, sin
 
 import polars as pl
 
-from datasets.experiment.plan import READINGS, SENSORS
-from schemas.errors import UsageError
+from datasets.experiment.bank import READINGS, SENSORS
+from datasets.experiment.geometry import CONSTELLATIONS
+from pipeline.show.svg_plot import COLOURS, HEIGHT, WIDTH, Axis, Curve, both_ways_log, even_ticks, plot, svg, text
 
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
-    from matplotlib.figure import Figure
-
-_COLOURS = {"gps": "#1f5fa8", "gps_galileo": "#c4561a"}
 _NAMES = {"gps": "GPS", "gps_galileo": "GPS + Galileo"}
-_LINES = {"odometer": "--", "odometer_and_track": "-"}
-_SENSOR_NAMES = {"odometer": "odometer only", "odometer_and_track": "odometer and track"}
+_SENSOR_NAMES = {"odometer": "odometer only", "odometer_and_track": "with track"}
+_PMD_RATES_MPS = (0.01, 0.03, 0.1)
+_DETECT_RATES_MPS = (0.03, 0.1, 0.5, 1.0)
+_SINCE_RATES_MPS = (0.03, 0.1, 1.0)
+_DETECT_S = (1.0, 10.0, 100.0, 1_000.0, 10_000.0)
+_HEADINGS = Axis("heading [deg]", 0.0, 75.0, (0.0, 15.0, 30.0, 45.0, 60.0, 75.0))
+_HORIZON = 0.42 * HEIGHT
+_TIMES_S = (-3000.0, -1000.0, -300.0, -100.0, -30.0, -10.0, -3.0, 0.0, 3.0, 10.0, 30.0, 100.0, 300.0)
 
 
-def require_matplotlib() -> None:
-    """Say what to install before hours of simulation, not after."""
-    if importlib.util.find_spec("matplotlib") is None:
-        raise UsageError(
-            "pictures need matplotlib",
-            found="not installed",
-            remedy="Install `balise[plots]`.",
+def drawn_figures(pmd: pl.DataFrame, detection: pl.DataFrame, geometry: pl.DataFrame) -> dict[str, str]:
+    """SVG by name of the file, from the tables `pmd`, `detection` and `geometry` of `diagnostics`."""
+    by_heading = detection.sort("heading_deg", maintain_order=True)
+    drawn = {f"figure_4_sky_{name}": _sky_figure(geometry, name) for name in CONSTELLATIONS}
+    drawn |= {f"figure_5_pmd_{reading}": _pmd_figure(pmd, reading) for reading in READINGS}
+    for reading, name in product(READINGS, CONSTELLATIONS):
+        drawn[f"figure_6_time_to_detect_{reading}_{name}"] = _time_figure(by_heading, reading, name)
+    drawn |= {f"figure_7_time_since_failure_{rate:g}": _since_figure(by_heading, rate) for rate in _SINCE_RATES_MPS}
+    return {f"{name}.svg": drawing for name, drawing in drawn.items()}
+
+
+def _points(frame: pl.DataFrame, *columns: str) -> list[tuple[float, float]]:
+    return list(frame.select(columns).drop_nulls().iter_rows())
+
+
+def pmd_plot(title: str, curves: Sequence[Curve]) -> str:
+    """Pmd over the time since failure [s] (DIAG Fig. 5), the axis at least from -1 to 1 s."""
+    times_s = [time_s for curve in curves for time_s, _ in curve.points]
+    low, high = min([-1.0, *times_s]), max([1.0, *times_s])
+    ticks = [tick for tick in _TIMES_S if low <= tick <= high]
+    times = Axis("time since failure T_dsf [s], linear about 0, logarithmic beyond", low, high, ticks, both_ways_log)
+    return plot(title, times, Axis("Pmd", 0.0, 1.0, (0.0, 0.2, 0.4, 0.6, 0.8, 1.0)), curves)
+
+
+def _pmd_figure(pmd: pl.DataFrame, reading: str) -> str:
+    ahead = pmd.filter(reading=reading, sensors="odometer", heading_deg=0.0)
+    curves = []
+    for constellation, (number, rate) in product(CONSTELLATIONS, enumerate(_PMD_RATES_MPS)):
+        chosen = ahead.filter(constellation=constellation, rate_mps=rate)
+        curve = Curve(
+            f"{_NAMES[constellation]}, {rate:g} m/s",
+            _points(chosen, "time_since_failure_s", "pmd"),
+            COLOURS[number],
+            dashed=constellation != "gps",
+            band=_points(chosen, "pmd_low", "pmd_high"),
         )
+        curves.append(curve)
+    return pmd_plot(f"Pmd over the time since failure: heading 0, odometer only, noise on {reading}", curves)
 
 
-def drawn_figures(pmd: pl.DataFrame, detection: pl.DataFrame, geometry: pl.DataFrame) -> dict[str, bytes]:
-    """Fig. 5 to 7 and the skyplot, both readings side by side; PNG without anything that changes from run to run."""
-    figures = {
-        "figure_5_pmd": _pmd_figure(pmd),
-        "figure_6_time_to_detect": _time_figure(detection.sort("heading_deg", maintain_order=True)),
-        "figure_7_time_since_failure": _since_figure(detection.sort("heading_deg", maintain_order=True)),
-        "figure_4_sky": _sky_figure(geometry),
-    }
-    return {f"{name}.png": _png(figure) for name, figure in figures.items()}
+def _time_figure(detection: pl.DataFrame, reading: str, constellation: str) -> str:
+    curves = []
+    for (number, rate), sensors in product(enumerate(_DETECT_RATES_MPS), SENSORS):
+        chosen = detection.filter(reading=reading, constellation=constellation, sensors=sensors, rate_mps=rate)
+        line = _points(chosen, "heading_deg", "time_to_detect_s")
+        name = f"{rate:g} m/s, {_SENSOR_NAMES[sensors]}"
+        curves.append(Curve(name, line, COLOURS[number], dashed=sensors == "odometer"))
+    title = f"Expected time to detect over heading: {_NAMES[constellation]}, noise on {reading}"
+    return plot(title, _HEADINGS, Axis("expected T_D [s]", _DETECT_S[0], 2.0 * _DETECT_S[-1], _DETECT_S, log10), curves)
 
 
-def _png(figure: Figure) -> bytes:
-    picture = io.BytesIO()
-    figure.savefig(picture, format="png", dpi=120, metadata={"Software": None})
-    return picture.getvalue()
+def _since_figure(detection: pl.DataFrame, rate_mps: float) -> str:
+    value, low, high = "time_since_failure_s", "time_since_failure_low_s", "time_since_failure_high_s"
+    known = detection.filter(sensors="odometer_and_track", rate_mps=rate_mps).drop_nulls(value)
+    curves = []
+    for (number, constellation), reading in product(enumerate(CONSTELLATIONS), READINGS):
+        chosen = known.filter(reading=reading, constellation=constellation)
+        name = f"{_NAMES[constellation]}, {reading}"
+        band = _points(chosen, low, high)
+        curves.append(Curve(name, _points(chosen, "heading_deg", value), COLOURS[number], reading == "position", band))
+    ends = (0.0, *known[low].to_list(), *known[high].to_list())
+    times = Axis("expected T_dsf [s]", min(ends), max(1.0, *ends), even_ticks(min(ends), max(1.0, *ends)))
+    return plot(f"Expected time since failure over heading, with track, {rate_mps:g} m/s", _HEADINGS, times, curves)
 
 
-def _panels(count: int, title: str) -> tuple[Figure, list[Axes]]:
-    from matplotlib.figure import Figure
-
-    figure = Figure(figsize=(6.0 * count, 4.6), layout="constrained")
-    figure.suptitle(title)
-    return figure, [figure.add_subplot(1, count, index + 1) for index in range(count)]
-
-
-def _readings(panels: list[Axes]) -> Iterator[tuple[Axes, str, str, str]]:
-    """Each panel with its reading, and the constellations in it with their colours."""
-    for axes, reading in zip(panels, READINGS, strict=True):
-        for constellation, colour in _COLOURS.items():
-            yield axes, reading, constellation, colour
-
-
-def _curve(axes: Axes, frame: pl.DataFrame, x: str, ys: tuple[str, ...], label: str, style: str, colour: str) -> None:
-    """A line, and the band of its bounds where `ys` names them."""
-    along, line, *band = (frame[name].to_list() for name in (x, *ys))
-    axes.plot(along, line, style, color=colour, label=label, markersize=3)
-    if band:
-        axes.fill_between(along, band[0], band[1], color=colour, alpha=0.15, linewidth=0)
-
-
-def _pmd_figure(pmd: pl.DataFrame) -> Figure:
-    figure, panels = _panels(len(READINGS), "Missed detection against time since failure, heading 0, odometer only")
-    for axes, reading, constellation, colour in _readings(panels):
-        for rate, style in {0.01: "-", 0.03: "--", 0.1: ":"}.items():
-            chosen = pmd.filter(
-                reading=reading, constellation=constellation, sensors="odometer", heading_deg=0.0, rate_mps=rate
-            )
-            label = f"{_NAMES[constellation]}, {rate:g} m/s"
-            _curve(axes, chosen, "time_since_failure_s", ("pmd", "pmd_low", "pmd_high"), label, style, colour)
-    for axes, reading in zip(panels, READINGS, strict=True):
-        axes.axvline(0.0, color="0.6", linewidth=0.8)
-        title = f"odometer noise on {reading}"
-        axes.set(title=title, xlabel="time since failure [s]", ylabel="Pmd", ylim=(-0.02, 1.02))
-        axes.legend(fontsize=7)
-    return figure
-
-
-def _time_figure(detection: pl.DataFrame) -> Figure:
-    figure, panels = _panels(len(READINGS), "Expected time to detect against heading")
-    for axes, reading, constellation, colour in _readings(panels):
-        for sensors in SENSORS:
-            for rate, marker in {0.03: "o", 0.1: "s", 0.5: "v", 1.0: "^"}.items():
-                chosen = detection.filter(reading=reading, constellation=constellation, sensors=sensors, rate_mps=rate)
-                label = f"{_NAMES[constellation]}, {_SENSOR_NAMES[sensors]}, {rate:g} m/s"
-                _curve(axes, chosen, "heading_deg", ("time_to_detect_s",), label, marker + _LINES[sensors], colour)
-    for axes, reading in zip(panels, READINGS, strict=True):
-        title = f"odometer noise on {reading}"
-        axes.set(title=title, xlabel="heading [deg]", ylabel="expected T_D [s]", yscale="log")
-        axes.legend(fontsize=5, ncols=2)
-    return figure
-
-
-def _since_figure(detection: pl.DataFrame) -> Figure:
-    rates = (0.03, 0.1, 1.0)
-    bounded = ("time_since_failure_s", "time_since_failure_low_s", "time_since_failure_high_s")
-    figure, panels = _panels(len(rates), "Expected time since failure against heading, with track")
-    known = detection.filter(sensors="odometer_and_track").drop_nulls(bounded[0])
-    for axes, rate in zip(panels, rates, strict=True):
-        for constellation, colour in _COLOURS.items():
-            for reading, style in zip(READINGS, ("o-", "s--"), strict=True):
-                chosen = known.filter(reading=reading, constellation=constellation, rate_mps=rate)
-                label = f"{_NAMES[constellation]}, noise on {reading}"
-                _curve(axes, chosen, "heading_deg", bounded, label, style, colour)
-        axes.axhline(0.0, color="0.6", linewidth=0.8)
-        axes.set(title=f"{rate:g} m/s", xlabel="heading [deg]", ylabel="expected T_dsf [s]")
-        axes.legend(fontsize=7)
-    return figure
-
-
-def _sky_figure(geometry: pl.DataFrame) -> Figure:
-    from matplotlib.figure import Figure
-
-    figure = Figure(figsize=(9.0, 4.6), layout="constrained")
-    for index, constellation in enumerate(_COLOURS):
-        axes = figure.add_subplot(1, 2, index + 1, projection="polar")
-        for row in geometry.filter(constellation=constellation).iter_rows(named=True):
-            place = (radians(row["azimuth_deg"]), 90.0 - row["elevation_deg"])
-            axes.plot(*([one] for one in place), "o", color="#c00000" if row["faulty"] else "#1f5fa8")
-            axes.annotate(row["sv"], place, fontsize=7)
-        # Azimuth runs clockwise from north, elevation from the rim to the zenith.
-        axes.set(theta_zero_location="N", theta_direction=-1, ylim=(0.0, 90.0), title=_NAMES[constellation])
-        axes.set_yticks([0.0, 30.0, 60.0], ["90°", "60°", "30°"])
-    return figure
+def _sky_figure(geometry: pl.DataFrame, constellation: str) -> str:
+    """Azimuth clockwise from north, elevation from the rim to the zenith."""
+    x0, y0 = WIDTH / 2, HEIGHT / 2
+    parts = [text(x0, y0 - _HORIZON - 6, "N", "middle")]
+    for elevation_deg in (0.0, 30.0, 60.0):
+        radius = _HORIZON * (1.0 - elevation_deg / 90.0)
+        parts.append(f'<circle cx="{x0}" cy="{y0}" r="{radius:.1f}" fill="none" stroke="#dddddd"/>')
+        parts.append(text(x0 + 3, y0 - radius + 14, f"{elevation_deg:g}°"))
+    for row in geometry.filter(constellation=constellation).iter_rows(named=True):
+        radius, azimuth = _HORIZON * (1.0 - row["elevation_deg"] / 90.0), radians(row["azimuth_deg"])
+        x, y = x0 + radius * sin(azimuth), y0 - radius * cos(azimuth)
+        colour = "#c00000" if row["faulty"] else COLOURS[0]
+        parts += [f'<circle cx="{x:.1f}" cy="{y:.1f}" r="4" fill="{colour}"/>', text(x + 6, y - 4, row["sv"])]
+    return svg(f"The sky: {_NAMES[constellation]}", HEIGHT, parts)

@@ -1,17 +1,17 @@
 """Satellite geometries of the experiment: rows, weights, and the 3-D errors that range errors become.
 
 Place, time and skyplot of the paper are lost, so the geometry is our choice, said here: nominal
-constellations above two European places, satellite 8 (slot B4 of GPS) faulty and above the mask.
+constellations above Brussels, satellite 8 (slot B4 of GPS) faulty and above the mask.
 """
 
 from __future__ import annotations
 
 from datetime import UTC, datetime
-from typing import Literal, NamedTuple
+from typing import Literal
 
 import numpy as np
 
-from datasets.constellation import GALILEO, GPS, SIDEREAL_DAY_S, look_angles
+from datasets.constellation import GALILEO, GPS, look_angles
 from pipeline.stages.monitors.pseudorange import clock_columns, line_of_sight_rows, range_variances_m2
 from schemas.arrays import Floats
 from schemas.frozen import frozen
@@ -26,27 +26,17 @@ SOURCES: tuple[str, ...] = ("ionosphere", "troposphere", "orbit_clock", "user")
 TAUS_S = np.array([360.0, 1800.0, 3600.0, 100.0])
 
 
-class NamedPlace(NamedTuple):
-    name: str
-    latitude_deg: float
-    longitude_deg: float
-    height_m: float
-
-
-BRUSSELS = NamedPlace("brussels", 50.85, 4.35, 100.0)
-MADRID = NamedPlace("madrid", 40.42, -3.70, 650.0)
-PLACES: tuple[NamedPlace, ...] = (BRUSSELS, MADRID)
-_DAY_NS = int(datetime(2024, 3, 20, tzinfo=UTC).timestamp()) * 1_000_000_000
-# 06:27 UTC: satellite 8 at 9 degrees in the south-west, 8 GPS and 16 GPS + Galileo satellites. One of the skies in
-# which all findings of the paper hold with odometer noise on position; `findings` gives the shares over the day.
-_DEFAULT_SECOND_OF_DAY = 23_220
+PLACE = "brussels"
+_LATITUDE_DEG, _LONGITUDE_DEG, _HEIGHT_M = 50.85, 4.35, 100.0
+# Satellite 8 at 9 degrees in the south-west, 8 GPS and 16 GPS + Galileo satellites. One of the skies in which all
+# findings of the paper hold with odometer noise on position.
+DEFAULT_NS = int(datetime(2024, 3, 20, 6, 27, tzinfo=UTC).timestamp()) * 1_000_000_000
 
 
 @frozen
 class Geometry:
     """A fixed sky: satellites with azimuth and elevation [deg], range error variances R_ij [m^2] by source."""
 
-    place: str
     t_ns: int
     constellation: Constellation
     svs: tuple[str, ...]
@@ -82,16 +72,18 @@ class Geometry:
         return np.array([[east, north, 0.0], [-north, east, 0.0], [0.0, 0.0, 1.0]])
 
 
-def geometry_at(place: NamedPlace, t_ns: int, constellation: Constellation, mask_deg: float = MASK_DEG) -> Geometry:
-    """The sky of a place; the faulty satellite must stand in it."""
+def geometry_at(t_ns: int, constellation: Constellation) -> Geometry:
+    """The sky above the experiment's place at this instant [ns since 1970, UTC].
+
+    Raises `ValueError` where the faulty satellite is below the mask.
+    """
     slots = GPS if constellation == "gps" else GPS + GALILEO
-    azimuth, elevation = look_angles(slots, np.array([t_ns]), place.latitude_deg, place.longitude_deg, place.height_m)
-    shown = np.flatnonzero(elevation[0] >= mask_deg)
+    azimuth, elevation = look_angles(slots, np.array([t_ns]), _LATITUDE_DEG, _LONGITUDE_DEG, _HEIGHT_M)
+    shown = np.flatnonzero(elevation[0] >= MASK_DEG)
     svs = tuple(slots[index].sv for index in shown)
     if FAULTY_SATELLITE not in svs:
-        raise ValueError(f"{FAULTY_SATELLITE} is below the mask at {place.name}, {t_ns}")
+        raise ValueError(f"{FAULTY_SATELLITE} is below the mask at {t_ns}")
     return Geometry(
-        place.name,
         t_ns,
         constellation,
         svs,
@@ -102,25 +94,6 @@ def geometry_at(place: NamedPlace, t_ns: int, constellation: Constellation, mask
     )
 
 
-def epochs_of_day(place: NamedPlace, count: int, mask_deg: float = MASK_DEG) -> list[int]:
-    """`count` epochs, evenly over that part of a sidereal day in which the faulty satellite is visible."""
-    minutes = _DAY_NS + (np.arange(0.0, SIDEREAL_DAY_S, 60.0) * 1e9).astype(np.int64)
-    faulty = [slot for slot in GPS if slot.sv == FAULTY_SATELLITE]
-    _, elevation = look_angles(faulty, minutes, place.latitude_deg, place.longitude_deg, place.height_m)
-    visible = minutes[elevation[:, 0] >= mask_deg]
-    picked = ((np.arange(count) + 0.5) / count * visible.size).astype(np.int64)
-    return [int(instant) for instant in visible[picked]]
-
-
 def default_geometry(constellation: Constellation) -> Geometry:
     """The geometry of the experiment at its own size."""
-    return geometry_at(BRUSSELS, _DAY_NS + _DEFAULT_SECOND_OF_DAY * 1_000_000_000, constellation)
-
-
-def skies_of_day(per_place: int) -> list[tuple[Geometry, ...]]:
-    """Both constellations at `per_place` epochs of each of the two places."""
-    return [
-        tuple(geometry_at(place, t_ns, constellation) for constellation in CONSTELLATIONS)
-        for place in PLACES
-        for t_ns in epochs_of_day(place, per_place)
-    ]
+    return geometry_at(DEFAULT_NS, constellation)

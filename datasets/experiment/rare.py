@@ -1,136 +1,313 @@
-"""Probabilities down to 1e-9 and below: missed detection and false alarm of any linear system.
+"""Rare events of a bank and of the pseudorange monitor, which is alone on its ranges.
 
-False alarm within a horizon (Adler, Blanchet and Liu 2012): an exceedance is forced at a monitor and epoch drawn
-at random, the rest of the path follows by conditioning, and the expected number of exceedances over the number seen is
-an unbiased estimate of the probability of at least one. Missed detections: `splitting`.
+When a missed detection has become as rare as railways ask, and how often healthy monitors alarm: on the noise of the
+published experiment, or on that of recorded runs. For the latter it is assumed that positions are as noisy as the
+thresholds count with (stated sigma with the shares and correlation times of the configuration, and the measured white
+noise), Gaussian, and alike throughout; nothing in the runs is at fault. A tail to 1e-9 is the model's, not the
+recording's: some hours hold no event so rare.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from functools import partial
-from math import isfinite
-from typing import NamedTuple
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
+import polars as pl
 
-from datasets.experiment.splitting import System, miss_estimate, most_probable_miss
-from datasets.experiment.tables import Row
-from datasets.experiment.workers import in_pieces
-from schemas.arrays import Floats
+from datasets.experiment.bank import READINGS, SENSORS, BankSpec, LinearBank, bank_of_axis, linear_bank
+from datasets.experiment.geometry import CONSTELLATIONS, Constellation, default_geometry
+from datasets.experiment.range_system import RangePlan, miss_at_one_epoch, range_system
+from datasets.experiment.sampling import (
+    SMALLEST,
+    System,
+    false_alarm_probability,
+    figures,
+    first_below,
+    missed_detection_probability,
+)
+from datasets.experiment.tables import Contents, Row, table
+from pipeline.results.store import read_config, read_table
+from pipeline.stages.monitors.axis import error_model
+from schemas.config import Configuration, threshold_factor
+from schemas.enums import MonitorState, RunStatus
+from schemas.errors import UsageError
+from schemas.frozen import frozen
+from schemas.tables import SCALES
 
-# Paths of all monitors must fit into some 64 MB.
-_LARGEST_BLOCK = 8_000_000
-# Independent populations of a split estimate: their scatter is its error.
-_POPULATIONS = 20
-_SMALLEST_POPULATION, _LARGEST_POPULATION = 250, 1_000
-_CLOSE_ENOUGH = 0.02
-SMALLEST = 1e-12
-"""No probability smaller than this is given, only that it is below."""
+REPETITIONS = 20_000
+TARGETS: tuple[float, ...] = (1e-4, 1e-9)
+_RATES_MPS = (0.01, 0.03, 0.1, 1.0)
+_TRANSIENT_RATES_MPS = (0.1, 1.0)
+# Ramps in a range, and how often residuals are recorded for them; the first time that a period comes alarms are asked.
+_RANGES_ASKED: tuple[tuple[float, float], ...] = ((0.01, 10.0), (0.01, 30.0), (0.1, 1.0), (0.1, 10.0))
+_SEARCH_RUNS = 500
+_FAILURE_LIMIT_M = 20.0
+_LONGEST_S = 10_000
+HOUR_S = 3_600.0
+_FAST_HZ, _SLOWEST_AT_FAST_MPS = 10.0, 0.1
+_ALARM_SHARE = 20
+# Seconds since the restart at the onset of a fault; none: long ago.
+AGES_S: tuple[float | None, ...] = (0.0, 10.0, 60.0, 300.0, None)
+# White noise of sigma w has the lasting part M = 1.5 w^2 in the thresholds (DOMAIN section 3: 4 M = 6 w^2).
+_LASTING = 1.5
 
-
-class Probability(NamedTuple):
-    """An estimate with its relative standard error, and how many plain runs it is worth per run made."""
-
-    value: float
-    relative_error: float
-    variance_reduction: float
-    runs: int
-
-
-def false_alarm_probability(system: System, epochs: int, runs: int = 4000, seed: int = 1, jobs: int = 1) -> Probability:
-    """Probability that healthy monitors, long after their restart, fail at least once in this many epochs."""
-    # Small enough for one thread of the linear algebra library, whose threads would cost more than they bring.
-    size = max(1, min(system.runs_per_block, _LARGEST_BLOCK // (epochs * system.size)))
-    alarms = partial(_alarms, system, epochs)
-    return pooled(np.concatenate(in_pieces(alarms, runs, size, (seed, system.streams[0]), jobs)), runs)
-
-
-def missed_detection_probability(
-    system: System, epochs: int, rate_mps: float, runs: int = 20_000, seed: int = 1, jobs: int = 1
-) -> Probability:
-    """Probability that no monitor fails at epochs 1 .. n of a range ramp of `rate_mps`."""
-    miss = partial(miss_estimate, system, epochs, rate_mps, most_probable_miss(system, epochs, rate_mps))
-    return pooled(np.array(in_pieces(miss, runs, population_of(runs), (seed, system.streams[1]), jobs)), runs)
-
-
-def population_of(runs: int) -> int:
-    """Size of the independent populations that share the runs; too small ones would lose all of theirs."""
-    return min(max(runs // _POPULATIONS, _SMALLEST_POPULATION), _LARGEST_POPULATION)
+_Bank = tuple[Constellation, LinearBank]
 
 
-def pooled(estimates: Floats, runs: int) -> Probability:
-    """Mean of independent unbiased estimates of equal weight, its relative error, and the gain over counting."""
-    greatest = float(estimates.max())
-    if greatest == 0.0:
-        return Probability(0.0, float("inf"), 1.0, runs)
-    # In units of the greatest, so that the squares of 1e-200 are still numbers.
-    shares = estimates / greatest
-    error = float(np.sqrt(shares.var(ddof=1) / shares.size) / shares.mean()) if shares.size > 1 else float("inf")
-    mean = greatest * float(shares.mean())
-    gain = (1.0 - mean) / mean / runs / error**2 if error > 0 else float("inf")
-    return Probability(mean, error, gain, runs)
+def run(
+    repetitions: int, seed: int, jobs: int, config: Configuration | None = None, recorded: Path | None = None
+) -> Contents:
+    """`missed`, `transients`, `false_alarms`, `pseudorange`; `repetitions` are the sampled runs.
 
-
-def _alarms(system: System, epochs: int, runs: int, rng: np.random.Generator) -> Floats:
-    # Stationary: the covariance depends on the lag alone, and lag zero is in the middle.
-    by_lag = system.by_lag(epochs)
-    paths = np.empty((epochs, system.size, runs))
-    state = system.start(runs, rng)
-    for path in paths:
-        state = system.following(state, rng)
-        path[:] = system.values(state)
-    at = rng.integers(0, epochs, runs)
-    pulls, per_epoch = system.forced(paths[at, :, np.arange(runs)], rng)
-    estimates = np.empty(runs)
-    for run, (place, pull) in enumerate(zip(at, pulls, strict=True)):
-        pulled = np.flatnonzero(pull)
-        together = by_lag[epochs - 1 - place : 2 * epochs - 1 - place, pulled]
-        # The forced one counts, whatever rounding does to it.
-        count = max(system.fails(paths[:, :, run] + pull[pulled] @ together), 1)
-        estimates[run] = epochs * per_epoch / count
-    return estimates
-
-
-def figures(result: Probability) -> Row:
-    """The estimate as it stands in a table; nulls where no run came through, which says nothing of the probability.
-
-    Below `SMALLEST` it is not given: the model of the noise does not hold so far out. `below` says so in its place.
+    With `recorded`, a replayed result: `noise` (what was taken from it), `missed`, `false_alarms` of each solution.
     """
-    shown = result.value >= SMALLEST
+    if recorded is not None:
+        return _on_recorded_noise(recorded, repetitions, seed, jobs, config)
     return {
-        "probability": result.value if shown else None,
-        "below": SMALLEST if 0.0 < result.value < SMALLEST else None,
-        "relative_error": result.relative_error if shown and isfinite(result.relative_error) else None,
-        "variance_reduction": result.variance_reduction if shown and isfinite(result.variance_reduction) else None,
-        "runs": result.runs,
+        "missed": missed_table(repetitions, seed, jobs, config),
+        "transients": transient_table(repetitions, seed, jobs, config),
+        "false_alarms": alarm_table(repetitions, seed, jobs, config),
+        "pseudorange": range_table(repetitions, seed, jobs, config),
     }
 
 
-def first_below(probability: Callable[[int], float], targets: Sequence[float], most_epochs: int) -> list[int | None]:
-    """Epochs after which a falling probability is below each target, within 2 %; None if that takes too many.
+def banks(config: Configuration | None, rate_hz: float = 1.0) -> Iterator[_Bank]:
+    """Both constellations and sensor sets, heading 0: the configured bank, or those of both readings."""
+    for constellation in CONSTELLATIONS:
+        for sensors in SENSORS:
+            specs = [BankSpec(reading=reading, sensors=sensors, rate_hz=rate_hz) for reading in READINGS]
+            if config is not None:
+                specs = [BankSpec.of(config.monitors, sensors, rate_hz)]
+            for spec in specs:
+                yield constellation, linear_bank(default_geometry(constellation), 0.0, spec)
 
-    Few runs per step do: time is found far better than probability, which falls steeply. An estimate of zero, all
-    runs lost, says nothing and counts as not below.
+
+def failure_epoch(bank: LinearBank, rate_mps: float) -> int:
+    """Epochs until the mean along-track error of a range ramp passes the limit, at most the published span."""
+    slope = abs(float(bank.along_error[0])) * rate_mps
+    seconds = _FAILURE_LIMIT_M / slope if slope > 0 else float(_LONGEST_S)
+    return int(min(seconds, _LONGEST_S) * bank.spec.rate_hz)
+
+
+def epochs_until(
+    system: System, rate_mps: float, targets: Sequence[float], seed: int, jobs: int, period_s: float
+) -> list[int | None]:
+    """Epochs after which the missed-detection probability is below each target; None if not within the span."""
+    return first_below(
+        lambda epochs: missed_detection_probability(system, epochs, rate_mps, _SEARCH_RUNS, seed, jobs).value,
+        targets,
+        int(_LONGEST_S / period_s),
+    )
+
+
+def miss_figures(
+    system: System, rate_mps: float, at_failure: int, period_s: float, runs: int, seed: int, jobs: int
+) -> Iterator[tuple[str, int, Row]]:
+    """What is asked of a ramp of `rate_mps`: why, after how many epochs of `period_s`, and the figures of a miss.
+
+    At the failure, after `at_failure` epochs, and when a miss is as rare as the targets.
     """
-    known: dict[int, float] = {}
-
-    def below(epochs: int, target: float) -> bool:
-        if epochs not in known:
-            known[epochs] = probability(epochs)
-        return 0.0 < known[epochs] < target
-
-    return [_bisected(below, target, most_epochs) for target in targets]
+    found = epochs_until(system, rate_mps, TARGETS, seed, jobs, period_s)
+    targets = [f"{target:g}" for target in TARGETS]
+    for reason, epochs in [("failure", at_failure), *zip(targets, found, strict=True)]:
+        if epochs is not None:
+            yield reason, epochs, figures(missed_detection_probability(system, epochs, rate_mps, runs, seed, jobs))
 
 
-def _bisected(below: Callable[[int, float], bool], target: float, most_epochs: int) -> int | None:
-    low, high = 1, 8
-    while not below(high, target):
-        if high >= most_epochs:
-            return None
-        low = high
-        high = min(2 * high, most_epochs)
-    while high - low > max(1, _CLOSE_ENOUGH * high):
-        middle = (low + high) // 2
-        low, high = (low, middle) if below(middle, target) else (middle, high)
-    return high
+def missed_table(runs: int, seed: int, jobs: int, config: Configuration | None) -> pl.DataFrame:
+    """Pmd at the mean failure, and the time that makes it as rare as each target, with the error of the estimate."""
+    asked = [(one, rate) for one in banks(config) for rate in _RATES_MPS]
+    # At 10 Hz the faster ramps of GPS, since slow ones differ little from 1 Hz.
+    asked += [(one, rate) for one in _fast(config) for rate in _RATES_MPS if rate >= _SLOWEST_AT_FAST_MPS]
+    rows: list[Row] = []
+    for (constellation, bank), rate in asked:
+        period_s = 1.0 / bank.spec.rate_hz
+        for reason, epochs, found in miss_figures(bank, rate, failure_epoch(bank, rate), period_s, runs, seed, jobs):
+            rows.append(_missed_row(constellation, bank, rate, epochs, reason) | found)
+    return table(rows)
+
+
+def _fast(config: Configuration | None) -> list[_Bank]:
+    return [one for one in banks(config, _FAST_HZ) if one[0] == "gps"]
+
+
+def _missed_row(constellation: Constellation, bank: LinearBank, rate: float, epochs: int, reason: str) -> Row:
+    """What was asked: a ramp of this rate [m/s] on a bank, so many epochs after its onset."""
+    return {
+        **_bank_row(constellation, bank.spec),
+        "rate_mps": rate,
+        "chosen_for": reason,
+        "time_s": epochs / bank.spec.rate_hz,
+        "mean_failure_s": failure_epoch(bank, rate) / bank.spec.rate_hz,
+    }
+
+
+def _bank_row(constellation: Constellation, spec: BankSpec) -> Row:
+    return {
+        "constellation": constellation,
+        "reading": spec.reading,
+        "alphas": spec.weights_text,
+        "sensors": spec.sensors,
+        "rate_hz": spec.rate_hz,
+    }
+
+
+def transient_table(runs: int, seed: int, jobs: int, config: Configuration | None) -> pl.DataFrame:
+    """Pmd of a fault that begins soon after a restart, and of one long after, at the time that makes the latter 1e-4.
+
+    Thresholds are exact at every age (DOMAIN section 3), so false alarms do not depend on it; misses do.
+    """
+    rows: list[Row] = []
+    for constellation, bank in banks(config):
+        for rate in _TRANSIENT_RATES_MPS if constellation == "gps" else ():
+            (epochs,) = epochs_until(bank, rate, (max(TARGETS),), seed, jobs, 1.0 / bank.spec.rate_hz)
+            for age_s in AGES_S if epochs is not None else ():
+                young = linear_bank(default_geometry(constellation), 0.0, replace(bank.spec, age_s=age_s))
+                missed = missed_detection_probability(young, epochs or 0, rate, runs, seed, jobs)
+                row = _missed_row(constellation, young, rate, epochs or 0, "transient")
+                rows.append({"age_s": age_s, **row, **figures(missed)})
+    return table(rows)
+
+
+def alarm_table(runs: int, seed: int, jobs: int, config: Configuration | None) -> pl.DataFrame:
+    """Probability that a healthy bank alarms at least once within an hour."""
+    rows: list[Row] = []
+    for constellation, bank in [*banks(config), *_fast(config)]:
+        asked = {"false_alarm_probability": bank.spec.false_alarm_probability, "horizon_s": HOUR_S}
+        found = alarm_figures(bank, int(HOUR_S * bank.spec.rate_hz), runs, seed, jobs)
+        rows.append(_bank_row(constellation, bank.spec) | asked | found)
+    return table(rows)
+
+
+def alarm_figures(system: System, epochs: int, runs: int, seed: int, jobs: int) -> Row:
+    """Figures of at least one alarm in so many epochs; a share of the `runs` suffices."""
+    return figures(false_alarm_probability(system, epochs, max(runs // _ALARM_SHARE, 20), seed, jobs))
+
+
+def range_table(runs: int, seed: int, jobs: int, config: Configuration | None) -> pl.DataFrame:
+    """The same of the pseudorange monitor, heading 0: misses, and alarms within an hour."""
+    rows: list[Row] = []
+    for constellation in CONSTELLATIONS:
+        periods = []
+        for rate, period_s in _RANGES_ASKED:
+            plan = RangePlan(default_geometry(constellation), period_s=period_s)
+            if config is not None:
+                plan = replace(plan, false_alarm_probability=config.monitors.false_alarm_probability)
+            system = range_system(plan, 0.0)
+            labels = {"constellation": constellation, "period_s": period_s}
+            failure_s = min(plan.mean_failure_s(0.0, rate), float(_LONGEST_S))
+            at_failure = int(failure_s / period_s)
+            for reason, epochs, found in miss_figures(system, rate, at_failure, period_s, runs, seed, jobs):
+                time_s = epochs * period_s
+                at_most = max(miss_at_one_epoch(system, rate * time_s), SMALLEST)
+                asked = {"event": "missed_detection", "rate_mps": rate, "chosen_for": reason, "time_s": time_s}
+                rows.append(labels | asked | {"mean_failure_s": failure_s, "at_most": at_most} | found)
+            if period_s not in periods:
+                alarm = {"event": "false_alarm", "time_s": HOUR_S}
+                rows.append(labels | alarm | alarm_figures(system, int(HOUR_S / period_s), runs, seed, jobs))
+            periods.append(period_s)
+    return table(rows)
+
+
+@frozen
+class RecordedNoise:
+    """Noise along the track of one solution over all runs of a result: medians over epochs and runs.
+
+    `ratios`: by scale, scatter of the monitors over what the thresholds count with; below 1 they scatter less.
+    """
+
+    solution: str
+    runs: int
+    hours: float
+    rate_hz: float
+    sigma_m: float
+    white_m: float
+    ratios: tuple[float | None, ...]
+
+    def bank(self, config: Configuration, rate_hz: float) -> LinearBank:
+        """The configured bank on this noise."""
+        shares, taus_s = error_model(config.monitors)
+        spec = BankSpec.of(config.monitors, "odometer", rate_hz)
+        return bank_of_axis(spec, shares * self.sigma_m**2, taus_s, float(np.sqrt(_LASTING)) * self.white_m)
+
+    @property
+    def row(self) -> Row:
+        """As it stands in the table `noise`."""
+        return {
+            "solution": self.solution,
+            "runs": self.runs,
+            "hours": self.hours,
+            "gnss_rate_hz": self.rate_hz,
+            "sigma_along_m": self.sigma_m,
+            "white_noise_along_m": self.white_m,
+            **{f"ratio_{scale}": ratio for scale, ratio in zip(SCALES, self.ratios, strict=True)},
+        }
+
+
+def _on_recorded_noise(result: Path, runs: int, seed: int, jobs: int, config: Configuration | None) -> Contents:
+    noises = recorded_noises(result)
+    settings = config or read_config(result) or Configuration()
+    missed = [row for noise in noises for row in _missed_rows(noise, settings, runs, seed, jobs)]
+    false_alarms = []
+    for noise in noises:
+        labels = {"solution": noise.solution, "horizon_s": HOUR_S, "evaluated_hz": noise.rate_hz}
+        bank = noise.bank(settings, noise.rate_hz)
+        false_alarms.append(labels | alarm_figures(bank, int(HOUR_S * noise.rate_hz), runs, seed, jobs))
+    return {
+        "noise": table([noise.row for noise in noises]),
+        "missed": table(missed),
+        "false_alarms": table(false_alarms),
+    }
+
+
+def recorded_noises(result: Path) -> list[RecordedNoise]:
+    """Of runs without injected faults. Raises `UsageError` where no run has a sigma and a measured white noise."""
+    runs = (
+        read_table(result, "runs").filter(pl.col("status") == RunStatus.OK.value, ~pl.col("faults_injected")).collect()
+    )
+    known = runs.filter(pl.col("white_noise_along_m").is_not_null(), pl.col("gnss_rate_hz").is_not_null())
+    if known.is_empty():
+        raise UsageError(
+            "has no run whose noise along the track is known",
+            place=str(result),
+            expected="runs with an odometer, without injected faults, replayed to the end",
+            found=f"{runs.height} fault-free runs, none with `white_noise_along_m`" if runs.height else "no such run",
+            remedy="Replay fault-free runs of some minutes, with their odometer.",
+        )
+    return [_noise_of(result, solution, part) for (solution,), part in known.group_by("solution", maintain_order=True)]
+
+
+def _noise_of(result: Path, solution: object, runs: pl.DataFrame) -> RecordedNoise:
+    factor = threshold_factor((read_config(result) or Configuration()).monitors.false_alarm_probability)
+    ratios = [factor * pl.col(f"along_{scale}_value") / pl.col(f"along_{scale}_threshold") for scale in SCALES]
+    judged = [pl.col(f"along_{scale}_state") == MonitorState.PASS.value for scale in SCALES]
+    rms = [r.filter(j).pow(2).mean().sqrt().alias(scale) for r, j, scale in zip(ratios, judged, SCALES, strict=True)]
+    epochs = read_table(result, "epochs").filter(
+        pl.col("run_id").is_in(runs["run_id"].to_list()), pl.col("solution") == solution, ~pl.col("alarm")
+    )
+    row = epochs.select(pl.col("sigma_along_m").median(), *rms).collect().row(0, named=True)
+    return RecordedNoise(
+        solution=str(solution),
+        runs=runs.height,
+        hours=float(runs["duration_s"].sum()) / HOUR_S,
+        rate_hz=float(np.median(runs["gnss_rate_hz"])),
+        sigma_m=float(row["sigma_along_m"]),
+        white_m=float(np.median(runs["white_noise_along_m"])),
+        ratios=tuple(row[scale] for scale in SCALES),
+    )
+
+
+def _missed_rows(noise: RecordedNoise, config: Configuration, runs: int, seed: int, jobs: int) -> Iterator[Row]:
+    """Pmd of ramps along the track at the failure, and when it is as rare as the targets."""
+    for rate_mps in _RATES_MPS:
+        # Slower ramps are found by the averages, which see the same noise at 1 Hz and at 10 Hz.
+        rate_hz = noise.rate_hz if rate_mps >= _SLOWEST_AT_FAST_MPS else min(1.0, noise.rate_hz)
+        bank = noise.bank(config, rate_hz)
+        failure_s = config.hazards.limits.failure_m / rate_mps
+        at_failure = int(min(failure_s, _LONGEST_S) * rate_hz)
+        for reason, epochs, found in miss_figures(bank, rate_mps, at_failure, 1.0 / rate_hz, runs, seed, jobs):
+            of = {"solution": noise.solution, "rate_mps": rate_mps, "evaluated_hz": rate_hz, "chosen_for": reason}
+            time_s = epochs / rate_hz
+            yield of | {"time_s": time_s, "time_since_failure_s": time_s - failure_s} | found

@@ -5,14 +5,13 @@ from __future__ import annotations
 import json
 from collections.abc import Mapping
 from pathlib import Path
-from typing import NamedTuple
 
 import numpy as np
 import polars as pl
 from polars import selectors as cs
 
 from pipeline import storage
-from pipeline.stages.run_row.bounds import CONFIDENCE, clopper_pearson
+from pipeline.stages.run_row.bounds import CONFIDENCE, clopper_pearson, columns_of
 from pipeline.storage.described import noted_bytes
 from schemas.arrays import Floats
 from schemas.version import SOFTWARE
@@ -20,60 +19,35 @@ from schemas.version import SOFTWARE
 # By name: tables, and pages and pictures under their whole name.
 Contents = Mapping[str, pl.DataFrame | str | bytes]
 Row = dict[str, object]
+_TIME_PARTS = ("", "_standard_error", "_low", "_high", "_median", "_median_low", "_median_high")
 
 
 def share(name: str, count: int, trials: int) -> Row:
     """`name`, `name_low` and `name_high`: a share and its exact bounds, null without trials."""
-    found = clopper_pearson(count, trials)
-    return {name: found.value, f"{name}_low": found.low, f"{name}_high": found.high}
-
-
-class Expected(NamedTuple):
-    """Mean with its standard error and bounds that hold for any distribution on the known range."""
-
-    mean: float
-    standard_error: float
-    low: float
-    high: float
-    median: float
-    median_low: float
-    median_high: float
-
-
-def expected(values: Floats, least: float, greatest: float, confidence: float = CONFIDENCE) -> Expected | None:
-    """Mean and median of independent values known to lie within [least, greatest]; none without values.
-
-    Mean: empirical Bernstein bound, two-sided (Maurer and Pontil 2009, theorem 4), finite-sample.
-    Median: order statistics with binomial coverage.
-    """
-    from scipy.stats import binom  # takes half a second to load
-
-    n = values.size
-    if n < 2:
-        return None
-    mean = float(values.mean())
-    variance = float(values.var(ddof=1))
-    log = float(np.log(4.0 / (1.0 - confidence)))
-    half = np.sqrt(2.0 * variance * log / n) + 7.0 * (greatest - least) * log / (3.0 * (n - 1))
-    ordered = np.sort(values)
-    below = int(binom.ppf((1.0 - confidence) / 2.0, n, 0.5))
-    return Expected(
-        mean=mean,
-        standard_error=float(np.sqrt(variance / n)),
-        low=max(least, mean - float(half)),
-        high=min(greatest, mean + float(half)),
-        median=float(np.median(values)),
-        median_low=float(ordered[max(below - 1, 0)]),
-        median_high=float(ordered[min(n - below, n - 1)]),
-    )
+    return columns_of(name, clopper_pearson(count, trials))
 
 
 def time_columns(name: str, times_s: Floats, least: float, greatest: float) -> Row:
-    """`name_s` and its errors and bounds `name_low_s`, ...; nulls without values."""
-    found = expected(times_s, least, greatest)
-    figures = found or (None,) * len(Expected._fields)
-    suffixes = ("", *(f"_{field}" for field in Expected._fields[1:]))
-    return {f"{name}{suffix}_s": figure for suffix, figure in zip(suffixes, figures, strict=True)}
+    """Mean and median of independent times known to lie within [least, greatest], as columns; nulls of fewer than two.
+
+    `name_s`, its standard error, and bounds that hold for any distribution on that range. Mean: empirical Bernstein
+    bound, two-sided (Maurer and Pontil 2009, theorem 4), finite-sample. Median: order statistics, binomial coverage.
+    """
+    from scipy.stats import binom  # takes half a second to load
+
+    columns = [f"{name}{part}_s" for part in _TIME_PARTS]
+    n = times_s.size
+    if n < 2:
+        return dict.fromkeys(columns)
+    mean = float(times_s.mean())
+    variance = float(times_s.var(ddof=1))
+    log = float(np.log(4.0 / (1.0 - CONFIDENCE)))
+    half = np.sqrt(2.0 * variance * log / n) + 7.0 * (greatest - least) * log / (3.0 * (n - 1))
+    ordered = np.sort(times_s)
+    below = int(binom.ppf((1.0 - CONFIDENCE) / 2.0, n, 0.5))
+    of_mean = (mean, float(np.sqrt(variance / n)), max(least, mean - float(half)), min(greatest, mean + float(half)))
+    of_median = (float(np.median(times_s)), float(ordered[max(below - 1, 0)]), float(ordered[min(n - below, n - 1)]))
+    return dict(zip(columns, of_mean + of_median, strict=True))
 
 
 def table(rows: list[Row]) -> pl.DataFrame:

@@ -87,22 +87,23 @@ def _source(job: RunJob) -> _CalibrationRun:
             run = log.read(path)
         site = site_of(job.site, job.site_digest, job.config.site)
         site = with_route(site, job.route, job.config.site) if job.route else site
-        seen = observe(run, site, job.vehicle, job.config, run.main_solution())
+        observed = observe(run, site, job.vehicle, job.config, run.main_solution())
     except InputError as error:
         return _CalibrationRun(job.run_id, log.digest, reason=str(error))
-    if seen.estimate is None:
+    if observed.estimate is None:
         return _CalibrationRun(job.run_id, log.digest, reason="GNSS and odometer cannot be compared")
-    if seen.alarms:
-        return _CalibrationRun(job.run_id, log.digest, reason=f"alarms beyond its noise ({', '.join(seen.alarms)})")
-    return _CalibrationRun(job.run_id, log.digest, seen)
+    if observed.alarms:
+        return _CalibrationRun(job.run_id, log.digest, reason=f"alarms beyond its noise ({', '.join(observed.alarms)})")
+    return _CalibrationRun(job.run_id, log.digest, observed)
 
 
 def _calibrated(job: RunJob, sources: Sequence[_CalibrationRun]) -> RunJob:
+    """The job with the calibration that other fault-free runs give."""
     from pipeline.studies.calibration.calibrate import calibration_of
 
-    seen = [source.observed for source in sources if source.observed is not None]
+    observed = [source.observed for source in sources if source.observed is not None]
     try:
-        calibration = calibration_of(seen, job.vehicle, job.config)
+        calibration = calibration_of(observed, job.vehicle, job.config)
     except BaliseError as error:
         raise UsageError(error.message, place=error.place, found=error.found, remedy=error.remedy) from None
     names = tuple(source.run_id for source in sources)
@@ -116,6 +117,7 @@ def _calibrated(job: RunJob, sources: Sequence[_CalibrationRun]) -> RunJob:
 
 
 def _require_enough(job: RunJob, count: int, refused: str) -> None:
+    """Refuse to calibrate by too few runs."""
     least = job.config.calibration.least_runs
     if count < least:
         raise UsageError(

@@ -54,9 +54,11 @@ class DaskEngine(Engine):
         return max(1, 2 * self._threads)
 
     def lonely_s(self) -> float:
+        """Time for which there has been no worker [s]."""
         return 0.0 if self._threads else time.monotonic() - self._seen_s
 
     def submit(self, job: RunJob) -> Result:
+        """Hand a run to the cluster; the result is set when its task ends, however that was."""
         task = self._client.submit(replay_there, job, self._limit_s + WAITS.grace_s, pure=False)
         result: Result = Future()
         self._tasks[result] = task
@@ -78,11 +80,13 @@ class DaskEngine(Engine):
         threading.Thread(target=self._end, args=(task, self._workers.get(task.key, "")), daemon=True).start()
 
     def is_lost_worker(self, error: BaseException) -> bool:
+        """Whether an error means that the worker died."""
         from distributed.scheduler import KilledWorker
 
         return isinstance(error, LostWorkerError | KilledWorker)
 
     def collected(self, result: Result) -> None:
+        """Forget a task whose result has been taken."""
         key = self._tasks.pop(result).key
         self._workers.pop(key, None)
         if self._client.status == "running":
@@ -90,6 +94,7 @@ class DaskEngine(Engine):
                 self._ask(self._client.scheduler.event_clear, name=key)
 
     def close(self) -> None:
+        """Leave the cluster; its workers stay."""
         with contextlib.suppress(Exception):
             self._client.close(timeout=1)
 
@@ -98,6 +103,7 @@ class DaskEngine(Engine):
         self._workers[event[1]["key"]] = event[1]["worker"]
 
     def _end(self, task: Any, worker: str) -> None:
+        """End the worker of a run, begin it anew, and give up the run."""
         with contextlib.suppress(Exception):
             self._client.sync(
                 self._client.scheduler.restart_workers,
@@ -111,6 +117,7 @@ class DaskEngine(Engine):
         task.cancel()
 
     def _ask(self, question: Any, **arguments: str) -> Any:
+        """Ask the scheduler, which must answer within a time."""
         return self._client.sync(question, callback_timeout=WAITS.scheduler_answer_s, **arguments)
 
     def _count(self) -> int:
@@ -120,8 +127,8 @@ class DaskEngine(Engine):
                 raise ConnectionError
             threads: int = sum(self._ask(self._client.scheduler.ncores).values())
         except Exception as error:
-            silent_s = time.monotonic() - self._heard_s
-            if isinstance(error, TimeoutError) and silent_s < WAITS.lonely_s:
+            unanswered_s = time.monotonic() - self._heard_s
+            if isinstance(error, TimeoutError) and unanswered_s < WAITS.lonely_s:
                 return self._threads
             raise lost_scheduler(self.name) from error
         self._heard_s = time.monotonic()
@@ -172,6 +179,7 @@ def _begin() -> None:
 
 
 def lost_scheduler(scheduler: str) -> UsageError:
+    """The error for a scheduler that does not answer any more."""
     return UsageError(
         "the Dask scheduler does not answer",
         place=redacted(scheduler),

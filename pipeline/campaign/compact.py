@@ -26,6 +26,7 @@ class Compaction:
 
     @property
     def sentence(self) -> str:
+        """What was packed, and what stays in files of its own, for people."""
         files = "1 file" if self.packs == 1 else f"{self.packs} files"
         return f"{self.packed} runs lie in {files} per table, {self.own} in files of their own"
 

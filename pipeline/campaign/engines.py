@@ -47,6 +47,7 @@ class Engine:
         return 1
 
     def submit(self, job: RunJob) -> Result:
+        """Hand over a run; the result is set when it ends."""
         raise NotImplementedError
 
     def has_begun(self, result: Result) -> bool:
@@ -61,11 +62,11 @@ class Engine:
         return False
 
     def lonely_s(self) -> float:
-        """For how long there has been no worker to hand runs to [s]."""
+        """Time for which there has been no worker to hand runs to [s]."""
         return 0.0
 
     def collected(self, result: Result) -> None:
-        """The campaign has seen the result and is done with it."""
+        """Forget a run whose result the campaign has taken."""
 
     def close(self) -> None:
         """End whatever is still under way, at once."""
@@ -80,6 +81,7 @@ class SerialEngine(Engine):
         self._limit_s = limit_s
 
     def submit(self, job: RunJob) -> Result:
+        """Replay a run here and now, within the time limit."""
         result: Result = Future()
         try:
             with _alarm(self._limit_s):
@@ -97,6 +99,7 @@ class _Overdue(StopRun):
 
 @contextlib.contextmanager
 def _alarm(limit_s: float) -> Iterator[None]:
+    """End what runs within this context once it takes too long."""
 
     def ring(signum: int, frame: FrameType | None) -> None:
         raise _Overdue
@@ -124,35 +127,43 @@ class LocalEngine(Engine):
         self.start_limit_s = WAITS.start_s
 
     def capacity(self) -> int:
+        """Number of worker processes."""
         return len(self._idle) + len(self._busy)
 
     def submit(self, job: RunJob) -> Result:
+        """Hand a run to an idle worker."""
         result = self._idle[-1].submit(job)
         self._busy[result] = self._idle.pop()
         return result
 
     def has_begun(self, result: Result) -> bool:
+        """Whether the worker of a run has started up."""
         return self._busy[result].is_ready
 
     def kill(self, result: Result) -> None:
+        """End the worker of a run that takes too long."""
         self._busy[result].kill()
 
     def is_lost_worker(self, error: BaseException) -> bool:
+        """Whether an error means that the worker died."""
         return isinstance(error, BrokenExecutor)
 
     def collected(self, result: Result) -> None:
+        """Make the worker of a run idle again."""
         slot = self._busy.pop(result)
         if _was_without_memory(result):
             slot.kill()  # what it still holds would be lacking to the next run
         self._idle.append(slot)
 
     def close(self) -> None:
+        """End all workers."""
         for slot in (*self._idle, *self._busy.values()):
             slot.kill()
         self._folder.cleanup()
 
 
 def _was_without_memory(result: Result) -> bool:
+    """Whether a run ended because memory ran out."""
     return not result.cancelled() and result.exception() is None and result.result().error == NO_MEMORY
 
 
@@ -167,6 +178,7 @@ class _WorkerSlot:
         self._runs = 0
 
     def submit(self, job: RunJob) -> Result:
+        """Hand a run to the process, which is begun anew after so many runs or where it died."""
         self._runs += 1
         if self._runs > WAITS.runs_per_process:
             self.kill()
@@ -198,6 +210,7 @@ class _WorkerSlot:
         self._runs = 0
 
     def _started(self) -> ProcessPoolExecutor:
+        """The executor of the worker's process, begun anew if that process is gone."""
         if self._process is not None and not self._process.is_alive():
             self.kill()
         if self._executor is None:
@@ -219,6 +232,7 @@ class _KnownProcesses(SpawnContext):
         self.made: list[SpawnProcess] = []
 
     def Process(self, *args: Any, **kwargs: Any) -> SpawnProcess:  # type: ignore[override]  # noqa: N802
+        """Begin a process, and remember it, so that it can be ended."""
         self.made.append(SpawnProcess(*args, **kwargs))
         return self.made[-1]
 
@@ -247,6 +261,7 @@ def _begin_worker(ground: Path) -> None:
 
 
 def _go_with_parent() -> None:
+    """End a worker process when its parent ends."""
     parent = multiprocessing.parent_process()
     if parent is not None:
         parent.join()

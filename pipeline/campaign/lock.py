@@ -45,6 +45,7 @@ def check_held(out: Address, name: str) -> None:
 
 @contextlib.contextmanager
 def _locked_local(out: Path, name: str) -> Iterator[None]:
+    """Hold the lock of a local folder of results."""
     held = FileLock(out / HELD)
     with storage.as_output_error(out):
         out.mkdir(parents=True, exist_ok=True)
@@ -86,6 +87,7 @@ def _locked_remote(out: str, name: str) -> Iterator[None]:
 
 
 def _wait_for_silence(place: str, out: str) -> None:
+    """Wait until the holder of a lock must be gone; refuse if it renews the lock meanwhile."""
     seen = _content(place)
     until = time.monotonic() + WAITS.lock_silence_s
     while seen and time.monotonic() < until:
@@ -97,6 +99,7 @@ def _wait_for_silence(place: str, out: str) -> None:
 
 
 def _content(place: Address) -> str:
+    """What a lock says; empty if there is none."""
     return (storage.content_of(place) or b"").decode()
 
 
@@ -112,6 +115,7 @@ def _beat(place: str, name: str, ended: threading.Event) -> None:
 
 
 def _busy(out: Address) -> OutputError:
+    """The error for results that another campaign is writing."""
     return OutputError(
         "another campaign is writing here",
         place=redacted(str(out)),

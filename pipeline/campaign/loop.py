@@ -97,6 +97,7 @@ class CampaignLoop:
                 watch.look(ages)
 
     def _hand_out(self) -> None:
+        """Hand runs to the engine, as many as it has capacity for."""
         capacity = self._engine.capacity()
         while self._waiting and len(self._under_way) < capacity and self._stop is None:
             attempt = self._waiting.popleft()
@@ -104,6 +105,7 @@ class CampaignLoop:
             self._under_way[self._engine.submit(attempt.job)] = _RunUnderWay(attempt, now, now)
 
     def _note(self, outcome: RunOutcome | None) -> None:
+        """Keep the outcome of a run, and tell all watches."""
         if outcome is not None:
             self.outcomes.append(outcome)
             for watch in self._watches:
@@ -150,6 +152,7 @@ class CampaignLoop:
         )
 
     def _end_overdue(self) -> None:
+        """End runs that take too long, or whose worker never comes up."""
         now = time.monotonic()
         for result, item in self._under_way.items():
             if result.done():
@@ -183,4 +186,5 @@ class CampaignLoop:
 
 
 def _failed(attempt: _Attempt, failure: RunFailure) -> RunOutcome:
+    """The outcome of a run that failed."""
     return replace(fail_run(attempt.job, failure), attempts=attempt.number)

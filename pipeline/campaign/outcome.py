@@ -13,7 +13,7 @@ from pipeline.campaign.plan import RunJob
 from pipeline.results.figures.hazard_words import hazard_words
 from pipeline.results.figures.head import worst_verdict
 from pipeline.results.figures.known_counts import HAZARD_COUNTS, known_counts
-from pipeline.results.outcome import BESIDE, RunOutcome
+from pipeline.results.outcome import VERDICT_FIGURES, RunOutcome
 from pipeline.stages.provenance import Provenance
 from pipeline.storage.address import Address, redacted
 from schemas.enums import RunStatus, RunVerdict
@@ -43,14 +43,17 @@ class ChangedError(InputError):
 
 
 def changed(address: Address) -> ChangedError:
+    """The error for a log that changed while it was read."""
     return ChangedError("changed while it was read", place=str(address), remedy="Replay it again when it is complete.")
 
 
 def overdue(limit_s: float) -> str:
+    """The error text of a run that took too long."""
     return f"took longer than the time limit of {limit_s:g} s"
 
 
 def lost(attempts: int) -> str:
+    """The error text of a run whose workers died."""
     return (
         f"its worker died {attempts} times (killed, or out of memory). "
         "Give it more memory or fewer --jobs; the next call tries it again."
@@ -58,6 +61,7 @@ def lost(attempts: int) -> str:
 
 
 def never_begun(workers: int) -> str:
+    """The error text of a run for which no worker came up."""
     return f"{workers} workers died before they started this run. See the logs of the workers."
 
 
@@ -74,7 +78,7 @@ def failure_of(error: BaseException, lasting: bool) -> RunFailure:
 
 
 def _lacks_memory(error: BaseException | None) -> bool:
-    """Also where a library could not be loaded for want of it."""
+    """Whether memory ran out; also where a library could not be loaded for want of it."""
     while error is not None:
         without = isinstance(error, OSError) and error.errno == errno.ENOMEM
         unloaded = isinstance(error, ImportError) and ("map segment" in str(error) or "allocate" in str(error))
@@ -104,7 +108,8 @@ def outcome_of(
 ) -> RunOutcome:
     """The outcome that a run's own tables show; below `low` availability it says what the moving time was lost to."""
     errors = runs["error"].drop_nulls().to_list()
-    judged = known_counts(runs).drop_nulls("missed_detections")
+    counted = runs.select("status", "evidence", *HAZARD_COUNTS, "missed_detections")
+    judged = known_counts(counted).drop_nulls("missed_detections")
     *counts, missed = judged.select(pl.sum(*HAZARD_COUNTS, "missed_detections")).row(0)
     verdict = worst_verdict(runs["verdict"].to_list())
     return RunOutcome(
@@ -117,16 +122,16 @@ def outcome_of(
         why=_why(runs, verdict),
         faults=tuple(hazard_words(hazards, passages)),
         log=redacted(log),
-        **_figures_beside_verdict(runs, verdict, low),
+        **_figures_of_verdict(runs, verdict, low),
     )
 
 
-def _figures_beside_verdict(runs: pl.DataFrame, verdict: RunVerdict | None, low: float) -> dict[str, Any]:
-    """What stands beside the verdict, of the solution that heads the run; nothing where all failed."""
+def _figures_of_verdict(runs: pl.DataFrame, verdict: RunVerdict | None, low: float) -> dict[str, Any]:
+    """Figures next to the verdict, of the solution that heads the run; nothing where all failed."""
     if verdict is None:
         return {}
     row = runs.filter(pl.col("verdict").cast(pl.String) == verdict.value).row(0, named=True)
-    figures = {name: row[name] for name in BESIDE}
+    figures = {name: row[name] for name in VERDICT_FIGURES}
     figures |= {name: tuple(row[name] or ()) for name in ("remedies", "remedies_gain")}
     available = row["availability"]
     if available is None or available >= low:

@@ -75,9 +75,24 @@ def make_plan(
     write_routes: Address | None = None,
     given: SettingsFiles | None = None,
 ) -> Plan:
-    """Resolve what the user named. Raises `UsageError` or `SiteError` before any work is done.
+    """Resolve what the user named, before any work is done.
 
-    `routes`: a route file for all runs, or a folder with one per run id. `write_routes`: a folder for those found.
+    Args:
+        runs: paths, globs, folders and addresses.
+        site: address of the site.
+        out: folder of the result.
+        config: the configuration; None: the defaults.
+        vehicle: what is known of the vehicle; None: nothing.
+        routes: a route file for all runs, or a folder with one per run id.
+        write_routes: a folder for the routes found.
+        given: the settings as the user wrote them, to be kept with the result.
+
+    Returns:
+        One job per run.
+
+    Raises:
+        UsageError: no run is found, or the arguments contradict each other.
+        SiteError: the site breaches the contract.
     """
     config = config or Configuration()
     vehicle = vehicle or Vehicle()
@@ -146,7 +161,17 @@ def digests(job: RunJob, files_digest: str) -> dict[str, str]:
 
 
 def find_runs(named: Iterable[str]) -> dict[str, str]:
-    """Addresses by run id, sorted: paths, globs, folders of runs and `s3://`-style addresses."""
+    """Find the runs that the user named.
+
+    Args:
+        named: paths, globs, folders of runs and `s3://`-style addresses.
+
+    Returns:
+        Absolute addresses by run id, sorted.
+
+    Raises:
+        UsageError: a name finds nothing, or two runs have the same id.
+    """
     addresses: dict[str, str] = {}
     for name in named:
         for address in _expand(name):
@@ -177,7 +202,7 @@ def _check_name(run_id: str, address: Address) -> None:
 
 
 def _expand(name: str) -> list[Address]:
-    """What cannot be told from a run by its name is taken for one: whether it can be read is found out later."""
+    """Logs at a place; what its name does not show to be no run is taken for one until it is read."""
     matches = storage.require_match(name)
     return [
         run for match in matches for run in ([match] if is_run(match) or not files.is_dir(match) else _runs_in(match))

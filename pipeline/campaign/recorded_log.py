@@ -44,6 +44,7 @@ class RecordedLog:
         return (catalogue.kept(self._job.out, self._note(), self._key()) or b"").decode()
 
     def _note(self) -> str:
+        """Name of the file that keeps what is known of a log from campaign to campaign."""
         return f"inputs/{hashlib.sha256(self._job.run_id.encode()).hexdigest()}.txt"
 
     def _key(self) -> str:
@@ -65,6 +66,7 @@ class RecordedLog:
             self._check_unchanged(path)
 
     def read(self, path: Path) -> RunLog:
+        """Read the run from a local copy; a file that makes the reader panic is damaged."""
         try:
             run = read_run(path, self._job.config.ingest)
         except pl.exceptions.PanicException as error:
@@ -90,20 +92,24 @@ class RecordedLog:
         return self.digest
 
     def _stored_version(self) -> str | None:
+        """Version of a log in an object store; none for a local one."""
         return storage.version(self._job.address) if is_url(self._job.address) else None
 
     def _check_unchanged(self, path: Path) -> None:
+        """Refuse a log that changed since it was first looked at."""
         if _signature(path) != self.state:
             raise changed(path)
 
 
 def _signature(path: Path) -> tuple[storage.FileState, ...]:
+    """Size and time of change of each file of a log."""
     with _as_input_error(path):
         return storage.signature(path)
 
 
 @contextlib.contextmanager
 def _as_input_error(path: Path) -> Iterator[None]:
+    """Report what the system reports as an error of the input."""
     try:
         yield
     except OSError as error:

@@ -62,7 +62,7 @@ def keep_in_place(out: str, known: Mapping[str, RunOutcome]) -> None:
 
 
 def keep(plan: Plan, outcomes: Iterable[RunOutcome]) -> None:
-    """Keep what can be proved, beside what is known of runs that this call did not name."""
+    """Keep what can be proved, with what is known of runs that this call did not name."""
     if is_url(plan.out):
         return
     named = {job.run_id for job in plan.jobs}
@@ -71,6 +71,7 @@ def keep(plan: Plan, outcomes: Iterable[RunOutcome]) -> None:
 
 
 def _keep(out: str, outcomes: list[RunOutcome]) -> None:
+    """Keep the outcomes of a campaign that ends early."""
     # It can be done without, and so must not hide why a campaign ends.
     with contextlib.suppress(OutputError):
         catalogue.keep(out, _NAME, software_digest(), _OUTCOMES.dump_json(outcomes))
@@ -87,6 +88,7 @@ def kept(out: str) -> dict[str, RunOutcome]:
 
 
 def _holds(job: RunJob, outcome: RunOutcome) -> bool:
+    """Whether an outcome kept is still that of the same log, settings and program."""
     if is_url(job.address) or (job.write_route and not Path(job.write_route).exists()):
         return False
     try:
@@ -96,6 +98,7 @@ def _holds(job: RunJob, outcome: RunOutcome) -> bool:
 
 
 def _made_of(job: RunJob, log: tuple[storage.FileState, ...]) -> str:
+    """Digest of all that an outcome depends on."""
     return hashlib.sha256(repr((job.address, log, digests(job, ""))).encode()).hexdigest()
 
 

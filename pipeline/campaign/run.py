@@ -34,9 +34,23 @@ def run_campaign(
 ) -> CampaignSummary:
     """Replay every run of the plan whose result is not there already.
 
-    Raises `OutputError` where results cannot be written, `Interrupted` on SIGINT, SIGTERM and SIGHUP; either way
-    what is complete stays, and the same call later does the rest. The tables are the same for any `jobs`,
-    any `scheduler` and any order of runs.
+    Whatever is raised, what is complete stays, and the same call later does the rest. The tables are the same for any
+    `jobs`, any `scheduler` and any order of runs.
+
+    Args:
+        plan: what to replay, as `make_plan` yields it.
+        jobs: number of processes.
+        scheduler: address of a Dask scheduler; None: this machine.
+        force: replay runs whose result is there already, too.
+        time_limit_s: longest time for one run [s].
+        watches: what is told of the progress.
+
+    Returns:
+        What became of each run.
+
+    Raises:
+        OutputError: results cannot be written.
+        Interrupted: on SIGINT, SIGTERM and SIGHUP.
     """
     _check_shared(plan, scheduler)
     with locked(plan.out) as campaign:
@@ -64,6 +78,7 @@ def run_campaign(
 
 
 def _engine_for(jobs: int, runs: int, scheduler: str | None, limit_s: float) -> Engine:
+    """The engine that suits a number of runs and processes."""
     if scheduler is not None and runs:
         return DaskEngine(scheduler, limit_s)
     return SerialEngine(limit_s) if runs <= 1 and HAS_ALARM else LocalEngine(max(1, min(jobs, runs)))

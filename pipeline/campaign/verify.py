@@ -69,10 +69,12 @@ class Verification:
 
     @property
     def table(self) -> pl.DataFrame:
+        """One row per problem."""
         return pl.DataFrame(self.problems, schema=dict.fromkeys(_COLUMNS, pl.String), orient="row")
 
     @property
     def sentence(self) -> str:
+        """How much was compared, and how much of it does not agree, for people."""
         left_out = " and ".join(_NOT_COMPARED[item] for item in self.not_compared)
         rest = f"; not compared: {left_out}" if left_out else ""
         return f"{self.compared}: {f'{len(self.problems)} do not' if self.problems else 'all'} agree{rest}"
@@ -180,10 +182,12 @@ def _parts(run: dict[str, Any]) -> dict[str, str | None]:
 
 
 def _sites(sites: dict[str, Any]) -> dict[str, str]:
+    """Digests of the files of each site."""
     return {f"{site}, {file['name']}": file["sha256"] for site, files in sites.items() for file in files}
 
 
 def _digests(files: dict[str, Any]) -> dict[str, str]:
+    """Digests of files, by name."""
     return {name: file["sha256"] for name, file in files.items()}
 
 
@@ -197,6 +201,7 @@ def as_kept(out: Address, digest: str) -> Verification:
 
 
 def _manifest(out: Address) -> Manifest:
+    """The manifest of results; runs not yet complete in it are completed."""
     store.complete_runs(out)
     anchor(out)  # there is one
     return read_manifest(out) or {}
@@ -240,6 +245,7 @@ def _tables(out: Address, runs: Sequence[str]) -> dict[str, dict[str, str]]:
 
 
 def _pages(out: Address) -> dict[str, str]:
+    """Digests of the pages of the report, by name."""
     folder = join(out, "report")
     return {name: sha256(storage.content_of(join(folder, name))) for name in storage.files_below(folder)}
 
@@ -303,6 +309,7 @@ def _settings(config_digest: str, manifest: Manifest) -> str:
 
 
 def _differences(what: str, present: Mapping[str, str | None], expected: Mapping[str, str | None]) -> list[Problem]:
+    """Names of which the digest is not that expected, and both digests."""
     names = dict.fromkeys([*expected, *present])
     return [
         (f"{what}{name}", _short(present.get(name)), _short(expected.get(name)))
@@ -312,4 +319,5 @@ def _differences(what: str, present: Mapping[str, str | None], expected: Mapping
 
 
 def _short(digest: str | None) -> str:
+    """A digest in short, for people."""
     return "nothing" if not digest else digest[:12]

@@ -56,6 +56,7 @@ def replay_one(job: RunJob) -> RunOutcome:
 
 
 def _replay_one(job: RunJob, log: RecordedLog) -> RunOutcome:
+    """Replay a run, unless its results are there already."""
     _same_software(job)
     site = site_of(job.site, job.site_digest, job.config.site)
     if (known := log.known_digest()) and _is_done(job, known):
@@ -84,6 +85,7 @@ def fail_run(job: RunJob, failure: RunFailure, log: RecordedLog | None = None) -
 
 
 def _proved(job: RunJob, log: RecordedLog, outcome: RunOutcome) -> RunOutcome:
+    """An outcome with what proves of which log it is."""
     return replace(outcome, proof=proof_of(job, log.state))
 
 
@@ -97,12 +99,14 @@ def _write(job: RunJob, tables: RunTables, metadata: Mapping[str, str]) -> None:
 
 
 def _write_held(job: RunJob, tables: RunTables, metadata: Mapping[str, str]) -> None:
+    """Write the results of a run, while the lock of the campaign is still held."""
     if job.campaign:
         lock.check_held(job.out, job.campaign)
     store.write_run(tables, job.out, metadata)
 
 
 def _same_software(job: RunJob) -> None:
+    """Refuse to replay with another version of the program than the campaign's."""
     if software_digest() != job.software_digest:
         raise UsageError(
             "this worker runs another version of the program than the campaign",
@@ -112,6 +116,7 @@ def _same_software(job: RunJob) -> None:
 
 
 def _is_done(job: RunJob, files_digest: str) -> bool:
+    """Whether the results of a run are there, and of the same log, settings and program."""
     if job.previous is None or job.previous.get("redo") == "yes":
         return False
     if job.write_route and not files.exists(job.write_route):
@@ -133,6 +138,7 @@ def _earlier(job: RunJob, log: RecordedLog) -> RunOutcome:
 
 
 def _outcome(job: RunJob, *tables: pl.DataFrame) -> RunOutcome:
+    """The outcome of a run, of its tables."""
     return outcome_of(job.run_id, job.address, job.config.advice.low_availability, *tables)
 
 
@@ -156,6 +162,7 @@ def _write_travelled_route(job: RunJob, run: RunLog, site: Site) -> None:
 
 
 def _metadata(job: RunJob, log: RecordedLog | None, status: RunStatus) -> dict[str, str]:
+    """What the results of a run say about their origin."""
     digest, listed = ("", "") if log is None else (log.digest, log.files)
     raw = {"raw_files": log.raw_files} if log is not None and log.raw_files else {}
     return {**digests(job, digest), "log_files": listed, **raw, "site_files": job.site_files, "status": status.value}

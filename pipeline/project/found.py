@@ -21,7 +21,7 @@ from schemas.project import FILE_NAME
 _SITE_FILES = ("track.parquet", "track.csv", "track.geojson")
 _LINES = (".gpx", ".kml", ".kmz", ".geojson", ".json", *MAP_SUFFIXES)
 # Parts of a Shapefile, and what a desktop leaves behind.
-_BESIDE = (".shx", ".dbf", ".prj", ".cpg", ".qix", ".ini", ".db", ".md", ".html", ".pdf")
+_COMPANION_SUFFIXES = (".shx", ".dbf", ".prj", ".cpg", ".qix", ".ini", ".db", ".md", ".html", ".pdf")
 
 
 Kind = Literal["logs", "surveys", "sites", "balises", "vehicles", "configs"]
@@ -93,7 +93,7 @@ def _at(path: Path, seen: set[str], links: list[Path]) -> Iterator[Path]:
     require_name(path)
     if path.is_dir() and not is_site(path) and not is_one_log(path):
         yield from _inside(path, seen, links)
-    elif path.is_dir() or (path.is_file() and path.suffix.lower() not in _BESIDE):
+    elif path.is_dir() or (path.is_file() and path.suffix.lower() not in _COMPANION_SUFFIXES):
         yield path
 
 

@@ -55,6 +55,7 @@ def write_project(drafted: Drafted, folder: Path) -> Path:
 
 
 def next_command(file: Path) -> str:
+    """What to type next."""
     return "balise run" if file.parent.resolve() == Path.cwd() else f"balise run --project {file.parent}"
 
 
@@ -79,6 +80,7 @@ _UNACCEPTED = "they stand in the file as comments; remove the # or add --accept-
 
 
 def answer_of(drafted: Drafted, file: Path) -> dict[str, Any]:
+    """What `balise init --json` prints."""
     proposals = [vars(proposal) | {"toml": correction_lines(proposal.corrections)} for proposal in drafted.proposals]
     fields = ("run_id", "found", "toml", "accepted")
     return {

@@ -13,8 +13,9 @@ import polars as pl
 
 from pipeline.campaign.plan import is_run
 from pipeline.make.receivers import gather
-from pipeline.make.receivers.convert import UnknownError, of_topics
+from pipeline.make.receivers.convert import of_topics
 from pipeline.make.receivers.csv import TABLES, names_file
+from pipeline.make.receivers.messages import UnknownError
 from pipeline.project.convert import Recordings
 from pipeline.read.ingest import read_run
 from pipeline.read.ingest.csv_draft import draft_mapping
@@ -40,7 +41,7 @@ class StreamSpan:
 
 
 @frozen
-class SeenLog:
+class InspectedLog:
     """A log and what it feeds; `mapping`: of a table, by stream; `is_run`: needs no conversion; `parts`: what it
     consists of; `assumed`: what was taken for granted where its header leaves it open.
     """
@@ -55,29 +56,32 @@ class SeenLog:
 
     @property
     def has_positions(self) -> bool:
+        """It holds positions of a receiver."""
         return "gnss" in self.spans
 
     @property
     def start(self) -> datetime:
-        """Of the positions, else of all streams."""
+        """Begin of the positions, else of all streams."""
         return min(span.start for span in self._spans())
 
     @property
     def end(self) -> datetime:
+        """The last instant of any stream."""
         return max(span.end for span in self._spans())
 
-    def overlaps(self, other: SeenLog) -> bool:
+    def overlaps(self, other: InspectedLog) -> bool:
+        """Whether the times of two logs overlap."""
         return self.start < other.end and other.start < self.end
 
     def _spans(self) -> list[StreamSpan]:
         return [self.spans["gnss"]] if self.has_positions else list(self.spans.values())
 
 
-def look_at_dates(path: Path, config: IngestConfig, others: Sequence[SeenLog]) -> SeenLog | None:
+def look_at_dates(path: Path, config: IngestConfig, others: Sequence[InspectedLog]) -> InspectedLog | None:
     """A table whose dates may be day first or month first: in the one order that puts it within a day of other logs."""
     if path.suffix.lower() not in TABLES or names_file(config, path):
         return None
-    fitting: list[SeenLog] = []
+    fitting: list[InspectedLog] = []
     for order in ("day_first", "month_first"):
         try:
             log = _table(path, config, order)
@@ -89,25 +93,25 @@ def look_at_dates(path: Path, config: IngestConfig, others: Sequence[SeenLog]) -
     return fitting[0] if fitting and all(log.spans == fitting[0].spans for log in fitting) else None
 
 
-def look_at(path: Path, config: IngestConfig, day: date | None, recordings: Recordings) -> SeenLog:
+def look_at(path: Path, config: IngestConfig, day: date | None, recordings: Recordings) -> InspectedLog:
     """Read a log to see what it feeds. Raises `InputError` where nothing can be made of it."""
     if is_run(path):
         return _run(path, config)
     known = None if names_file(config, path) else recordings.known(path)
     if known is not None:
-        return _seen(path, known.gathered().streams, parts=known.parts)
+        return _inspected(path, known.gathered().streams, parts=known.parts)
     if path.suffix.lower() == ".csv" and not names_file(config, path):
         return _table(path, config)
     try:
         found = gather([path], config, day)
-        return _seen(path, found.streams, parts=found.parts)
+        return _inspected(path, found.streams, parts=found.parts)
     except UnknownError:
         if path.suffix.lower() not in TABLES:
             raise
         return _table(path, config)
 
 
-def _run(path: Path, config: IngestConfig) -> SeenLog:
+def _run(path: Path, config: IngestConfig) -> InspectedLog:
     """A run; an MCAP log without positions is a log that another one needs."""
     if path.suffix.lower() == ".mcap":
         own = of_topics(config, path)
@@ -118,23 +122,23 @@ def _run(path: Path, config: IngestConfig) -> SeenLog:
         run = read_run(path, config, with_digest=False)
         parts = _parts_of_folder(path, run)
     streams = {name: frame for name in STREAMS if (frame := run.stream(name)) is not None and frame.height}
-    return _seen(path, streams, is_run="gnss" in streams, parts=parts)
+    return _inspected(path, streams, is_run="gnss" in streams, parts=parts)
 
 
 def _parts_of_folder(path: Path, run: RunLog) -> tuple[LogPart, ...]:
-    """The columns and files of a run's folder that are none of the contract's, beside those that are."""
+    """The columns and files of a run's folder that are none of the contract's, and those that are."""
     used = [(name, frame.height) for name in STREAMS if (frame := run.stream(name)) is not None]
     whole = [LogPart(path.name, "file", f"{name}.parquet", rows, name) for name, rows in used]
     return (*whole, *(LogPart(path.name, "file", name, 0) for name in run.notes.skipped_topics))
 
 
-def _seen(
+def _inspected(
     path: Path,
     streams: Mapping[Stream, pl.DataFrame],
     mapping: Mapping[str, list[dict[str, Any]]] | None = None,
     is_run: bool = False,
     parts: tuple[LogPart, ...] = (),
-) -> SeenLog:
+) -> InspectedLog:
     spans: dict[Stream, StreamSpan] = {}
     for name, frame in streams.items():
         times = frame.to_series(0).drop_nulls()
@@ -144,10 +148,10 @@ def _seen(
         raise InputError("holds no row with a time", place=str(path), expected="positions, distances, speeds or reads")
     gnss = streams.get("gnss")
     fixed = 0 if gnss is None else (gnss["fix"].cast(pl.String) == Fix.RTK_FIXED.value).sum()
-    return SeenLog(path, spans, mapping or {}, is_run, gnss is not None and 2 * fixed > gnss.height, parts)
+    return InspectedLog(path, spans, mapping or {}, is_run, gnss is not None and 2 * fixed > gnss.height, parts)
 
 
-def _table(path: Path, config: IngestConfig, date_order: str | None = None) -> SeenLog:
+def _table(path: Path, config: IngestConfig, date_order: str | None = None) -> InspectedLog:
     """A table by the mapping that its header suggests."""
     text = draft_mapping(path)
     drafted = toml_of(text.encode(), f"mapping of {path}").get("ingest")
@@ -155,8 +159,8 @@ def _table(path: Path, config: IngestConfig, date_order: str | None = None) -> S
     mapping = {stream: entries if isinstance(entries, list) else [entries] for stream, entries in mapping.items()}
     if not mapping or any("time" not in entry for entries in mapping.values() for entry in entries):
         left_open = re.search(r"(?m)^# (time = .*?)  # (in .*)$", text)
-        told = "the names of its columns do not tell " + ("its time" if mapping else "what they are")
-        raise _undecided(path, f"{left_open[1]} is {left_open[2]}" if left_open else told)
+        reason = "the names of its columns do not tell " + ("its time" if mapping else "what they are")
+        raise _undecided(path, f"{left_open[1]} is {left_open[2]}" if left_open else reason)
     for entries in mapping.values():
         for entry in entries:
             entry["topic"] = path.name
@@ -169,8 +173,8 @@ def _table(path: Path, config: IngestConfig, date_order: str | None = None) -> S
         raise _undecided(path, error.message, error) from None
     own = {name: [{k: v for k, v in entry.items() if k != "topic"} for entry in of] for name, of in mapping.items()}
     assumed = ('its GPS times are taken for UTC; `time_scale = "gps"` in its mapping if they are 18 s ahead',)
-    seen = _seen(path, found.streams, own, parts=found.parts)
-    return replace(seen, assumed=assumed) if "\n# time_scale = " in text else seen
+    log = _inspected(path, found.streams, own, parts=found.parts)
+    return replace(log, assumed=assumed) if "\n# time_scale = " in text else log
 
 
 def _undecided(path: Path, why: str, error: InputError | None = None) -> InputError:

@@ -29,6 +29,7 @@ class Opened:
 
     @property
     def folder(self) -> Path:
+        """The folder that its paths are relative to."""
         return self.file.parent
 
     def place(self, named: str) -> str:
@@ -42,6 +43,7 @@ class Opened:
         return os.path.normpath(self.folder / (path.expanduser() if path.parts[:1] == ("~",) else path))
 
     def path(self, named: str | None) -> Path | None:
+        """A path that the project names, from the working directory; None where it names none."""
         return None if named is None else Path(self.place(named))
 
     @property
@@ -85,6 +87,7 @@ class Opened:
         return configuration_of(self.project, self.file)
 
     def given_vehicle(self) -> Vehicle:
+        """The vehicle file of the project, or what nothing is known of."""
         return load_settings(self.path(self.project.vehicle), Vehicle)
 
     def runs(self) -> list[str]:
@@ -158,8 +161,8 @@ def taken_from_project(
     _require_measured(opened, values)
     taken = {name: value for name, value in values.items() if name in missing}
     if taken and say is not None:
-        told = ", ".join(f"{name} {_shown(value)}" for name, value in taken.items())
-        say(f"balise: from {opened.file}: {told}")
+        taken_words = ", ".join(f"{name} {_shown(value)}" for name, value in taken.items())
+        say(f"balise: from {opened.file}: {taken_words}")
     return values
 
 

@@ -7,8 +7,9 @@ from pathlib import Path
 import polars as pl
 
 from pipeline.make.receivers.bags import describe_bag, is_bag
-from pipeline.make.receivers.convert import UnknownError, as_run, gather
+from pipeline.make.receivers.convert import as_run, gather
 from pipeline.make.receivers.csv import TABLES, names_file
+from pipeline.make.receivers.messages import UnknownError
 from pipeline.read.ingest.describe import description_of
 from pipeline.show.inspection import PARTS, inspect_csv, parts_table, tables_of_log
 from schemas.config import Configuration, Vehicle

@@ -7,7 +7,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 from pipeline.make.receivers.unpack import is_packed
-from pipeline.project.looking import SeenLog
+from pipeline.project.looking import InspectedLog
 
 # Recorders begin a new file every hour or every so many megabytes, and lose a few seconds between two at most.
 _NEXT_FILE_S = 60.0
@@ -18,12 +18,13 @@ class RecordedRun:
     """One run to be: `receivers` first the one under the name `primary`; of each the files that follow each other."""
 
     run_id: str
-    receivers: list[list[SeenLog]] = field(default_factory=list)
-    references: list[SeenLog] = field(default_factory=list)
-    others: list[SeenLog] = field(default_factory=list)
+    receivers: list[list[InspectedLog]] = field(default_factory=list)
+    references: list[InspectedLog] = field(default_factory=list)
+    others: list[InspectedLog] = field(default_factory=list)
 
     @property
-    def logs(self) -> list[SeenLog]:
+    def logs(self) -> list[InspectedLog]:
+        """All logs of the run."""
         return [*(log for files in self.receivers for log in files), *self.references, *self.others]
 
     @property
@@ -32,7 +33,9 @@ class RecordedRun:
         return [log.is_run for log in self.logs] == [True]
 
 
-def group_into_runs(logs: Sequence[SeenLog], references: Sequence[Path]) -> tuple[list[RecordedRun], list[SeenLog]]:
+def group_into_runs(
+    logs: Sequence[InspectedLog], references: Sequence[Path]
+) -> tuple[list[RecordedRun], list[InspectedLog]]:
     """The rides in order of time, and the logs that are of none of them.
 
     Logs without positions belong to every ride whose time they share; to the only ride whatever their clock says, so
@@ -42,7 +45,7 @@ def group_into_runs(logs: Sequence[SeenLog], references: Sequence[Path]) -> tupl
     positions = [log for log in logs if log.has_positions and log.path not in references]
     for log in sorted(positions, key=lambda log: (log.start, logs.index(log))):
         _place(log, recorded_runs)
-    alone: list[SeenLog] = []
+    alone: list[InspectedLog] = []
     for log in logs:
         if log in positions:
             continue
@@ -61,7 +64,7 @@ def group_into_runs(logs: Sequence[SeenLog], references: Sequence[Path]) -> tupl
     return _with_own_names(recorded_runs), alone
 
 
-def _place(log: SeenLog, recorded_runs: list[RecordedRun]) -> None:
+def _place(log: InspectedLog, recorded_runs: list[RecordedRun]) -> None:
     """A log continues a file of its kind, is another receiver of a ride, or begins a ride."""
     for recorded_run in recorded_runs:
         for files in recorded_run.receivers:
@@ -76,7 +79,7 @@ def _place(log: SeenLog, recorded_runs: list[RecordedRun]) -> None:
     recorded_runs.append(RecordedRun(stem_of(log.path), [[log]]))
 
 
-def _tested(recorded_run: RecordedRun) -> list[SeenLog]:
+def _tested(recorded_run: RecordedRun) -> list[InspectedLog]:
     return [log for files in recorded_run.receivers for log in files]
 
 

@@ -16,7 +16,7 @@ from pipeline.project.convert import Recordings, logs_of, run_of_logs
 from pipeline.project.made import Product, Record, digest_over
 from pipeline.project.opened import MEASURED_CONFIG, MEASURED_VEHICLE, RECORD, Opened, named_from
 from pipeline.read.ingest import read_run
-from pipeline.read.site.alike import told_in_short
+from pipeline.read.site.alike import summarise_findings
 from pipeline.read.site.read import read_site
 from pipeline.results import store
 from pipeline.results.manifest import settings_files
@@ -59,7 +59,7 @@ class Ended:
     unread: Sequence[str] = ()
 
     def lost(self, file: Path) -> list[str]:
-        """These logs in words, for whoever reads the verdict."""
+        """A sentence on each log that could not be read, for whoever reads the verdict."""
         return [
             f"NOT REPLAYED: {log} could not be read, and no figure knows of it. Mend it and name it in a [[convert]] "
             f"table; then, or where it is no log, take it out of `unread` in {file}."
@@ -78,6 +78,7 @@ class _Steps:
     changed: list[str] = field(default_factory=list)
 
     def bring(self, product: Product, make: Callable[[], Sequence[Path]]) -> bool:
+        """Make a product where its inputs changed; whether it was made."""
         brought = self.record.bring(product, make)
         if brought.made:
             self.changed.append(product.name)
@@ -132,7 +133,7 @@ def plan_of(opened: Opened) -> Plan:
 
 
 def _with_vehicles(plan: Plan, opened: Opened) -> Plan:
-    """Each run with the vehicle file that the project names for it."""
+    """Runs, each with the vehicle file that the project names for it."""
     files = {job.run_id: opened.vehicle_of(job.run_id) for job in plan.jobs}
     vehicles = {file: load_settings(file, Vehicle) for file in set(files.values())}
     digests = {file: digest_of(plan.config, vehicle) for file, vehicle in vehicles.items()}
@@ -144,7 +145,7 @@ def _with_vehicles(plan: Plan, opened: Opened) -> Plan:
 
 
 def _convert(steps: _Steps) -> None:
-    """Every run of logs; all that fail are told at once."""
+    """Convert every run of logs; all that fail are reported at once."""
     entries = steps.opened.project.convert
     config = steps.opened.given_config()
     failures: list[InputError] = []
@@ -220,7 +221,7 @@ def _write_site(steps: _Steps, wish: Wish, site: Path, vehicle: Vehicle, config:
     steps.call.said("site", f"made of {', '.join(path.name for path in wish.surveys)}")
     made = make_site(wish, vehicle, config)
     write_made(made, site_page(site.resolve().name, made), site, True)
-    for line in told_in_short(made.findings, f"{site / 'findings.csv'}"):
+    for line in summarise_findings(made.findings, f"{site / 'findings.csv'}"):
         steps.call.said("site", line)
     count = len(made.findings)
     steps.call.said("site", f"{count} findings in {site / 'findings.csv'}; look at {site / 'site.html'}")

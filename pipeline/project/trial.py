@@ -16,14 +16,14 @@ import tomli_w
 from pipeline.make.survey.make import make_site
 from pipeline.project.convert import Recordings, run_of_logs
 from pipeline.project.found import Kind, is_one_log, is_prose, is_site, logs_below, look_around, require_name
-from pipeline.project.looking import SeenLog, look_at, look_at_dates
+from pipeline.project.looking import InspectedLog, look_at, look_at_dates
 from pipeline.project.opened import Opened, named_from
 from pipeline.project.recorded_runs import RecordedRun, group_into_runs, stem_of
 from pipeline.project.run import wish_for
 from pipeline.read.ingest import read_run
 from pipeline.read.ingest.correct import corrected_further
 from pipeline.read.ingest.parts import LogPart, lines_of_parts
-from pipeline.read.site.alike import ambiguities, told_in_short
+from pipeline.read.site.alike import ambiguities, summarise_findings
 from pipeline.read.site.read import read_site
 from pipeline.storage.files import require_regular
 from pipeline.studies.plausibility.check import CONFIGURATION, FitState
@@ -108,7 +108,7 @@ def draft_project(wanted: Wanted, folder: Path, recordings: Recordings, accept: 
     site = _site(base)
     if site is not None:
         listed = "`balise inspect` of the site lists them"
-        drafted.remarks += told_in_short(ambiguities(site, base.given_config()), listed)
+        drafted.remarks += summarise_findings(ambiguities(site, base.given_config()), listed)
     entries = []
     ready = []
     of_odometers: dict[str, Sequence[str]] = {}
@@ -161,21 +161,21 @@ def _base(wanted: Wanted, folder: Path) -> Opened:
 
 def _looked_at(
     wanted: Wanted, config: IngestConfig, recordings: Recordings, remarks: list[str]
-) -> tuple[list[SeenLog], list[Path]]:
+) -> tuple[list[InspectedLog], list[Path]]:
     """Every log that was named, and of folders those that can be read; then files of folders that may be logs."""
     named = _named_logs(wanted)
-    seen: dict[Path, SeenLog] = {}
+    inspected: dict[Path, InspectedLog] = {}
     unread: dict[Path, BaliseError] = {}
     for place, (path, _) in named.items():
         try:
-            seen[place] = replace(look_at(path, config, wanted.day, recordings), path=place)
+            inspected[place] = replace(look_at(path, config, wanted.day, recordings), path=place)
         except BaliseError as error:
             unread[place] = error
     lost: list[Path] = []
-    sure = list(seen.values())
+    sure = list(inspected.values())
     for place, reason in unread.items():
         if (log := look_at_dates(place, config, sure)) is not None:
-            seen[place] = log
+            inspected[place] = log
             remarks.append(f"{place.name}: days and months of its dates in the order that fits the other logs")
         elif named[place][1]:
             raise reason
@@ -184,11 +184,11 @@ def _looked_at(
         else:
             lost.append(place)
             remarks.append(f"NOT READ, `balise run` will say so: {reason}")
-    return [seen[place] for place in named if place in seen], lost
+    return [inspected[place] for place in named if place in inspected], lost
 
 
 def _named_logs(wanted: Wanted) -> dict[Path, tuple[Path, bool]]:
-    """By its place each log as it was named, or lies in a folder; and whether it is an error that it cannot be read."""
+    """Each log by its place, as named or found in a folder; and whether one that cannot be read is an error."""
     surveys = {path.absolute() for path in wanted.track} | {Path(wanted.balises or "").absolute()}
     named: dict[Path, tuple[Path, bool]] = {}
     for raw in [*_expanded(wanted.raws), *_expanded(wanted.references)]:
@@ -238,7 +238,7 @@ def _expanded(raws: Sequence[Path]) -> list[Path]:
     return found
 
 
-def _unused(log: SeenLog) -> str:
+def _unused(log: InspectedLog) -> str:
     streams = ", ".join(log.spans)
     return (
         f"not used: {log.path}: {streams} from {log.start:%Y-%m-%d %H:%M:%S} to {log.end:%H:%M:%S}, in no ride's time"
@@ -269,7 +269,7 @@ def _notes_of(recorded_run: RecordedRun) -> list[str]:
     ]
 
 
-def _solution(recorded_run: RecordedRun, files: Sequence[SeenLog]) -> str:
+def _solution(recorded_run: RecordedRun, files: Sequence[InspectedLog]) -> str:
     """The first receiver is `primary`, others are named after their logs."""
     place = next(number for number, other in enumerate(recorded_run.receivers) if other is files)
     stems = [stem_of(others[0].path) for others in recorded_run.receivers]
@@ -341,6 +341,7 @@ def _of_all(said: Mapping[str, Sequence[str]]) -> list[str]:
 
 
 def correction_lines(corrections: Sequence[StreamCorrection]) -> list[str]:
+    """Corrections as lines of a project file."""
     tables = [tomli_w.dumps(correction.model_dump(exclude_defaults=True)) for correction in corrections]
     return [line for table in tables for line in ("[[convert.correct]]", *table.splitlines())]
 
@@ -353,7 +354,7 @@ def _corrections_of(report: FitReport) -> list[StreamCorrection]:
 
 def _by_recorder(
     proposed: list[StreamCorrection], recorded_run: RecordedRun, report: FitReport
-) -> tuple[list[StreamCorrection], SeenLog | None]:
+) -> tuple[list[StreamCorrection], InspectedLog | None]:
     """The same for all streams of one log, which have one clock; and that log, where its clock and not the GNSS's is
     corrected: what a receiver sends is never a time zone off.
     """

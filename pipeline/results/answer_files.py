@@ -42,6 +42,7 @@ def write_answer(
 
 
 def _writer_for(file: Path) -> Writer:
+    """What writes a file of this suffix."""
     writers: dict[str, Writer] = {".csv": write_csv, ".parquet": write_parquet, ".xlsx": write_xlsx}
     if file.suffix.lower() not in writers:
         raise UsageError("has an unknown suffix", place=str(file), expected=" or ".join(writers))
@@ -68,6 +69,7 @@ def write_csv(answer: pl.DataFrame, file: Path, guard: bool = True) -> None:
 
 
 def write_parquet(answer: pl.DataFrame, file: Path) -> None:
+    """Write an answer of `balise sql` with its provenance."""
     write_bytes(file, noted_bytes(answer, {"table": "answer of `balise sql`", "software": SOFTWARE}))
 
 

@@ -33,4 +33,5 @@ def kept(out: Address, name: str, key: str) -> bytes | None:
 
 
 def _address(out: Address, name: str) -> Address:
+    """Address of a file that is kept with the results."""
     return join(join(out, FOLDER), name)

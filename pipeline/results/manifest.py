@@ -74,6 +74,7 @@ class _Form(_Strict):
 
 
 def settings_files(configuration: Path | None = None, vehicle: Path | None = None) -> SettingsFiles:
+    """Names, sizes and digests of the settings files that were given."""
     paths = {"configuration": configuration, "vehicle": vehicle}
     return {name: None if path is None else _file(storage.file_digests(path)[0]) for name, path in paths.items()}
 
@@ -192,6 +193,7 @@ def anchor(out: Address) -> tuple[str, int]:
 
 
 def anchor_words(digest: str, runs: int) -> str:
+    """The line that a campaign prints: by it a manifest can be recognised later."""
     return f"{NAME}: sha256 {digest} of {runs} {'run' if runs == 1 else 'runs'}"
 
 
@@ -231,6 +233,7 @@ def _frame() -> Manifest:
 
 @cache
 def _packages() -> Mapping[str, str]:
+    """Versions of the packages that the program needs."""
     try:
         needed = [re.split(r"[^\w.-]", line)[0] for line in requires("balise") or [] if "extra ==" not in line]
     except PackageNotFoundError:
@@ -256,6 +259,7 @@ def _run(metadata: Mapping[str, str], runs_sha256: str) -> dict[str, Any]:
 
 
 def _files(listed: str | None) -> list[dict[str, Any]]:
+    """Files of a list in the form of the manifest."""
     return [_file(FileDigest(*file)) for file in _parsed(_LISTING, listed, [])]
 
 
@@ -268,19 +272,23 @@ def _parsed(kind: TypeAdapter[T], text: str | None, default: T) -> T:
 
 
 def _file(file: FileDigest) -> dict[str, Any]:
+    """A file in the form of the manifest."""
     return {"name": file.name, "bytes": file.size_bytes, "sha256": file.sha256}
 
 
 def _own_files(out: Address) -> dict[str, dict[str, Any]]:
+    """Size and digest of the files that the campaign itself wrote."""
     contents = {name: storage.content_of(join(out, name)) for name in own_file_names(out)}
     return {name: _digested(content) for name, content in contents.items() if content is not None}
 
 
 def _digested(content: bytes) -> dict[str, Any]:
+    """Size and digest of a content."""
     return {"bytes": len(content), "sha256": sha256(content)}
 
 
 def _write(out: Address, manifest: Manifest) -> None:
+    """Write the manifest, if it changed."""
     content = (json.dumps(manifest, indent=1, ensure_ascii=False) + "\n").encode()
     if storage.content_of(join(out, NAME)) != content:
         storage.write_bytes(join(out, NAME), content)

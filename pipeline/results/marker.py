@@ -25,6 +25,7 @@ class Marker:
 
     @classmethod
     def of_file(cls, run_id: str, content: bytes) -> Marker:
+        """The marker of a run from the content of its `runs` file."""
         return cls(run_id, sha256(content), content)
 
     @property

@@ -7,11 +7,11 @@ from typing import Any
 
 import polars as pl
 
-from pipeline.results.figures.head import CampaignHead, figures_beside, head_of
+from pipeline.results.figures.head import CampaignHead, head_of, verdict_figures
 from schemas.enums import RunStatus, RunVerdict
 from schemas.frozen import frozen
 
-BESIDE = {
+VERDICT_FIGURES = {
     "balises_found": pl.Int64,
     "balises_passed": pl.Int64,
     "balises_accepted": pl.Int64,
@@ -33,8 +33,8 @@ class RunOutcome:
     `verdict`: the worst of its solutions, None where all failed. `attempts` is more than one where workers were lost
     over it; `hazards` and `missed_detections` are None where nothing could be judged. `why`: what decides the verdict;
     `faults`: each in words, the worst first. `proof`: that of `resume`, empty where nothing is proved. `log`: what was
-    replayed. The figures beside the verdict, `remedies`, their gains and `lost` are of the solution that heads the run;
-    `lost`: what the moving time of a run of low availability was lost to.
+    replayed. The figures next to the verdict, `remedies`, their gains and `lost` are of the solution that heads the
+    run; `lost`: what the moving time of a run of low availability was lost to.
     """
 
     run_id: str
@@ -65,6 +65,7 @@ class RunOutcome:
 
     @property
     def defect(self) -> bool:
+        """The run failed by a defect of the program."""
         return self.trace is not None
 
 
@@ -79,31 +80,36 @@ class CampaignSummary:
         """The worst verdict of the runs that were reached, and their counts."""
         return head_of(outcome.verdict for outcome in self.outcomes)
 
-    def beside(self) -> dict[str, Any]:
-        """The figures beside the verdict over all runs that have one; nothing where none has."""
-        names = {**BESIDE, "verdict": pl.String}
+    def verdict_figures(self) -> dict[str, Any]:
+        """The figures next to the verdict over all runs that have one; nothing where none has."""
+        names = {**VERDICT_FIGURES, "verdict": pl.String}
         rows = [
             {name: getattr(outcome, name) for name in names}
             for outcome in self.outcomes
             if outcome.moving_s is not None
         ]
-        return dict(figures_beside(pl.DataFrame(rows, schema=names))) if rows else {}
+        return dict(verdict_figures(pl.DataFrame(rows, schema=names))) if rows else {}
 
     def count(self, status: RunStatus) -> int:
+        """How many runs ended so."""
         return sum(outcome.status == status for outcome in self.outcomes)
 
     @property
     def all_ok(self) -> bool:
+        """Every planned run is there, and is ok."""
         return self.count(RunStatus.OK) == self.planned
 
     @property
     def skipped(self) -> int:
+        """How many runs were there already."""
         return sum(outcome.skipped for outcome in self.outcomes)
 
     @property
     def defects(self) -> int:
+        """How many runs failed by a defect of the program."""
         return sum(outcome.defect for outcome in self.outcomes)
 
     @property
     def left(self) -> int:
+        """How many planned runs were not reached."""
         return self.planned - len(self.outcomes)

@@ -35,7 +35,7 @@ def read_rows(
     columns: Sequence[str],
     check: Callable[[str, ColumnTypes], object],
 ) -> Iterator[tuple[dict[str, int], pl.DataFrame]]:
-    """These columns of one table, pack by pack: how many rows each run has, and the rows, one run after the other.
+    """Columns of one table, pack by pack: how many rows each run has, and the rows, one run after the other.
 
     `check`, given a run, may refuse the columns that there are. Raises `UsageError` for a file that cannot be read.
     """
@@ -68,10 +68,12 @@ def as_written(out: Address, table: str, pack: Pack, rows: Sequence[int]) -> Ite
 
 
 def _file_of(out: Address, table: str, pack: Pack) -> _File:
+    """The file of a table within a pack."""
     return _File(str(out), table, pack.name, pack.ends[table])
 
 
 def _read(file: _File, spans: Sequence[Span], columns: Sequence[str] | None) -> pa.Table:
+    """Rows of a packed table."""
     try:
         source = _opened(file, _footer(file))
         numbers = source.groups(spans)
@@ -85,6 +87,7 @@ def _read(file: _File, spans: Sequence[Span], columns: Sequence[str] | None) -> 
 
 
 def _opened(file: _File, footer: pq.FileMetaData) -> GroupedFile:
+    """A packed table, opened by its footer."""
     return GroupedFile(files.in_parts(join(file.out, packs.file_name(file.table, file.name))), footer)
 
 
@@ -102,9 +105,11 @@ def _footer(file: _File) -> pq.FileMetaData:
 
 @lru_cache(maxsize=32)
 def _columns(file: _File) -> ColumnTypes:
+    """Columns of a packed table, with their types."""
     return _opened(file, _footer(file)).columns()
 
 
 @lru_cache(maxsize=16)
 def _group(file: _File, number: int, columns: tuple[str, ...] | None) -> pa.Table:
+    """One row group of a packed table."""
     return _opened(file, _footer(file)).read([number], columns)

@@ -72,6 +72,7 @@ def pack_runs(out: Address, runs_per_pack: int, jobs: int) -> Iterator[tuple[Pac
 
 
 def _take_apart(out: Address, runs_per_pack: int) -> None:
+    """Take packs apart that hold runs replayed since, or are less than half full."""
     listed = packs.listed(out)
     builds = set(_builds(out).values()) if listed else set()
     for pack in listed:
@@ -83,7 +84,7 @@ def _take_apart(out: Address, runs_per_pack: int) -> None:
 
 
 def _builds(out: Address) -> dict[str, str]:
-    """By which build of the program each run was made that has files of its own."""
+    """The build of the program that made each run with files of its own."""
     own = store.own_runs(out)
     return {marker.run_id: marker.metadata.get("software_digest", "") for marker in store.markers(out, own)}
 
@@ -105,6 +106,7 @@ def _sizes(out: Address, runs: Iterable[str]) -> dict[str, int]:
 
 
 def _portions(runs: Sequence[str], size_of: Mapping[str, int], most: int) -> Iterator[tuple[str, ...]]:
+    """Runs in portions of no more than a size."""
     portion: list[str] = []
     size = 0
     for run in runs:
@@ -145,6 +147,7 @@ class _PackWriter:
 
     @property
     def run_ids(self) -> list[str]:
+        """Runs written so far."""
         return [str(row[0]) for row in self._rows]
 
     def add(self, marker: Marker, tables: Mapping[str, pa.Table]) -> None:
@@ -178,7 +181,7 @@ class _PackWriter:
 
 
 def _named(run_id: str, table: pa.Table) -> pa.Table:
-    """With the id of the run in the first column."""
+    """The table with the id of the run in the first column."""
     field = pa.field("run_id", pa.large_string())
     return table.add_column(0, field, pa.repeat(pa.scalar(run_id, field.type), table.num_rows))
 
@@ -252,7 +255,7 @@ def _read_from(out: Address, pack: Pack) -> set[str]:
 
 
 def _unlike_error(pack: Pack, run_id: str) -> UsageError:
-    """Also of a pack that was changed: as a new one its rows would pass for whole."""
+    """The error for rows unlike the pack; also of one that was changed, whose rows would pass for whole."""
     return UsageError(
         "cannot be made again byte for byte by this build of the program",
         place=f"files of run {run_id}",

@@ -60,6 +60,7 @@ class Pack(BaseModel):
 
     @model_validator(mode="after")
     def _of_all(self) -> Self:
+        """A pack has a digest and an end for every table."""
         if self.sha256.keys() != {INDEX, *TABLES} or self.ends.keys() != set(TABLES):
             raise ValueError("not the digests of all files of a pack")
         return self
@@ -99,6 +100,7 @@ def listed(out: Address) -> list[Pack]:
 
 @lru_cache(maxsize=4)
 def _parsed(out: str, content: bytes) -> list[Pack]:
+    """The packs of a list."""
     try:
         return _List.model_validate_json(content).packs
     except ValidationError as error:
@@ -106,7 +108,7 @@ def _parsed(out: str, content: bytes) -> list[Pack]:
 
 
 def write_list(out: Address, packs: Sequence[Pack]) -> None:
-    """From now on these packs count."""
+    """Write the list of packs: from now on these count."""
     if not packs:
         storage.remove(join(out, LIST))
         return
@@ -120,10 +122,12 @@ def file_name(part: str, name: str) -> str:
 
 
 def file_digests(pack: Pack) -> dict[str, str]:
+    """SHA-256 of each file of a pack, by file name."""
     return {file_name(part, pack.name): digest for part, digest in pack.sha256.items()}
 
 
 def _whole(out: Address, file: str, digest: str) -> bytes:
+    """Content of a file of a pack, which must be there and whole."""
     content = storage.content_of(join(out, file))
     if content is None or sha256(content) != digest:
         raise unusable(out, file, "is missing" if content is None else "is damaged")
@@ -131,7 +135,7 @@ def _whole(out: Address, file: str, digest: str) -> bytes:
 
 
 def find(out: Address, among: Iterable[str] | None = None) -> dict[str, PackedRun]:
-    """Those of these runs that are packed; of all runs in the order of their ids."""
+    """The packed ones of these runs; of all runs in the order of their ids."""
     packs = listed(out)
     if not packs:
         return {}
@@ -142,7 +146,7 @@ def find(out: Address, among: Iterable[str] | None = None) -> dict[str, PackedRu
 
 @lru_cache(maxsize=4)
 def _places(out: str, packs: tuple[tuple[str, str], ...]) -> dict[str, tuple[int, int]]:
-    """By run the number of the last pack that has it, and the row there."""
+    """Number of the last pack that has each run, and the row there."""
     return {
         run_id: (number, row)
         for number, (name, digest) in enumerate(packs)
@@ -165,6 +169,7 @@ def index_of(out: Address, pack: Pack) -> Index:
 
 @lru_cache(maxsize=256)
 def _index(out: str, name: str, digest: str) -> Index:
+    """Rows of each run within the tables of a pack."""
     rows = _read_index(out, name, digest, tuple(column for column in INDEX_COLUMNS if column not in _OF_MARKER))
     starts = {table: np.concatenate([[0], rows[f"{table}_rows"].cum_sum().to_numpy()]) for table in TABLES}
     return Index(rows["run_id"].to_list(), starts)
@@ -176,6 +181,7 @@ def _read_index(out: str, name: str, digest: str, columns: tuple[str, ...]) -> p
 
 
 def markers(out: Address, runs: Mapping[str, PackedRun]) -> Iterator[Marker]:
+    """The markers of packed runs."""
     for pack, rows in by_pack(runs):
         index = _read_index(str(out), pack.name, pack.sha256[INDEX], ("run_id", *_OF_MARKER))
         yield from (Marker(*row) for row in index[list(rows.values())].iter_rows())
@@ -210,6 +216,7 @@ def steady(read: Callable[[], T]) -> T:
 
 
 def unusable(out: Address, file: str, reason: str) -> UsageError:
+    """The error for a pack that cannot be read, or is gone."""
     kind = UsageError if files.exists(join(out, file)) else GoneError
     return kind(
         f"cannot be read, and many runs are in it: {reason}",

@@ -41,7 +41,7 @@ def ground_of(track: pl.DataFrame, netelement_id: pl.Series, measure_m: Floats) 
     return GroundPositions(*columns)
 
 
-def beside(ground: GroundPositions, sign: Floats, left_m: Floats, above_m: Floats) -> GroundPositions:
+def offset_positions(ground: GroundPositions, sign: Floats, left_m: Floats, above_m: Floats) -> GroundPositions:
     """Places `left_m` to the left of growing path and `above_m` over the rails.
 
     `sign` is +1 where path and measure grow together, -1 where against each other. For metres, not kilometres.
@@ -133,7 +133,7 @@ def ground_at(track: pl.DataFrame, stretches: pl.DataFrame, path_m: Floats, marg
 
 
 def sign_of(epochs: pl.DataFrame, stretches: pl.DataFrame) -> Floats:
-    """Per epoch +1 where its path grows with the measure, -1 against it, NaN where that is not known."""
+    """+1 at epochs whose path grows with the measure, -1 against it, NaN where that is not known."""
     rows = epochs.select("netelement_id", "measure_m", "path_m").with_row_index("row")
     fitting = (
         rows.join(stretches, on="netelement_id", how="left", maintain_order="left")
@@ -159,7 +159,7 @@ def origin_of(site: Site) -> tuple[float, float]:
 
 
 def element_lines_m(site: Site) -> Iterator[tuple[str, Floats, Floats]]:
-    """Each net element as a line east and north of the origin [m], of no more points than a screen shows."""
+    """Lines of the net elements east and north of the origin [m], of no more points than a screen shows."""
     survey = track_of(site.track)
     nothing = np.full(len(survey.latitude_deg), np.nan)
     east, north = plane_m(GroundPositions(survey.latitude_deg, survey.longitude_deg, nothing, nothing), origin_of(site))

@@ -57,6 +57,7 @@ def run_sql(
 
 
 def _answered(out: Address, sql: str, allow_files: bool, others: Mapping[str, Address]) -> pl.DataFrame:
+    """The answer to a query."""
     if _SHOW.fullmatch(sql):
         return _tables_there_are(others)
     if described := _DESCRIBE.fullmatch(sql):
@@ -113,6 +114,7 @@ def named_results(given: Iterable[str]) -> dict[str, str]:
 
 
 def _check_query(sql: str, allow_files: bool) -> None:
+    """Refuse a query that does more than read tables."""
     begin = 0
     while before := _BEFORE.match(sql, begin):
         begin = before.end()
@@ -154,6 +156,7 @@ def _contracts(others: Iterable[str]) -> dict[str, tuple[str, type[dy.Schema]]]:
 
 
 def _tables_there_are(others: Iterable[str]) -> pl.DataFrame:
+    """All tables, with their meaning."""
     rows = [
         (name, len(kind.columns()), " ".join((kind.__doc__ or "").split()))
         for name, (_, kind) in _contracts(others).items()
@@ -163,6 +166,7 @@ def _tables_there_are(others: Iterable[str]) -> pl.DataFrame:
 
 
 def _columns_of(table: str, others: Iterable[str]) -> pl.DataFrame:
+    """Columns of a table, with units and meanings."""
     if (view := views.views().get(table.lower())) is not None:
         return pl.DataFrame(view.columns, schema=["column", "unit", "meaning"], orient="row")
     known = _contracts(others)
@@ -186,6 +190,7 @@ def _campaign_tables(out: Address, names: Iterable[str]) -> dict[str, pl.LazyFra
 
 
 def _campaign_table(name: str, source: bytes) -> pl.LazyFrame:
+    """A table of a campaign."""
     try:
         frame = parquet.read_parquet(source)
     except parquet.ParquetError as error:

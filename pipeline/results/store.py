@@ -26,7 +26,7 @@ from pipeline.storage.address import Address, is_url, join, redacted, shown
 from pipeline.storage.described import PREFIX, table_bytes
 from pipeline.storage.files import exists, read_bytes
 from schemas.config import Configuration, Settings, Vehicle, settings_from, to_toml, toml_of
-from schemas.conform import conform, dtypes
+from schemas.conform import dtypes
 from schemas.errors import ConfigError, UsageError
 from schemas.run import RunTables, Site
 from schemas.tables import CONTRACT_VERSION, TABLES
@@ -60,7 +60,7 @@ def write_run(tables: RunTables, out: Address, metadata: Mapping[str, str]) -> N
     for name in (*(name for name in TABLES if name != _MARKER), _MARKER):
         if name == _MARKER:
             noted["tables"] = json.dumps({table: sha256(content) for table, content in contents.items()})
-        contents[name] = table_bytes(conform(getattr(tables, name), TABLES[name]), name, TABLES[name], noted)
+        contents[name] = table_bytes(getattr(tables, name), name, TABLES[name], noted)
     write_files(out, tables.run_id, contents)
 
 
@@ -83,12 +83,28 @@ def write_files(out: Address, run_id: str, contents: Mapping[str, bytes]) -> Non
 
 
 def read_run(out: Address, run_id: str) -> RunTables:
+    """The five tables of one run."""
     frames = {name: read_table(out, name, run_id).drop("run_id").collect() for name in TABLES}
     return RunTables(run_id, **frames)
 
 
 def read_table(out: Address, table: str, run_id: str | None = None) -> pl.LazyFrame:
-    """One table of all complete runs, or of one, with the column `run_id` in front."""
+    """One table of a result, with the column `run_id` in front.
+
+    Args:
+        out: the result of a campaign.
+        table: name of the table: `hazards`, `passages`, `alarms`, `epochs` or `runs`.
+        run_id: one run; None for all complete ones.
+
+    Returns:
+        The rows, read where they are collected.
+
+    Raises:
+        UsageError: there is no such table or run.
+
+    Source:
+        CONTRACT section 3.
+    """
     if table not in TABLES:
         raise UsageError("is not a table", place=table, expected=", ".join(TABLES))
     runs = run_ids(out) if run_id is None else [run_id]
@@ -127,7 +143,7 @@ def _asked(runs: Sequence[str], predicate: pl.Expr | None) -> list[str]:
 
 
 def tables_of(out: Address, table: str, runs: Sequence[str], columns: Sequence[str] | None = None) -> pl.DataFrame:
-    """These columns (all) of one table of these runs, read now. Raises `UsageError` as `scan_runs`."""
+    """Columns (all) of one table of these runs, read now. Raises `UsageError` as `scan_runs`."""
     wanted = ["run_id", *dtypes(TABLES[table])] if columns is None else columns
     if not runs:
         return pl.DataFrame(schema={"run_id": pl.String(), **dtypes(TABLES[table])}).select(wanted)
@@ -153,7 +169,7 @@ def _in_order(runs: Sequence[str], heights: Mapping[str, int], parts: Sequence[p
 def _read_own(
     out: Address, table: str, runs: Sequence[str], columns: Sequence[str]
 ) -> Iterator[tuple[dict[str, int], pl.DataFrame]]:
-    """From the runs' own files: how many rows each run has, and the rows; nothing without runs."""
+    """Rows from the runs' own files, and how many each run has; nothing without runs."""
     run = ""
 
     def checked(recorded: Mapping[str, pl.DataType]) -> Sequence[str]:
@@ -177,6 +193,7 @@ def _read_own(
 
 
 def _check_columns(table: str, run_id: str, recorded: Mapping[str, pl.DataType]) -> None:
+    """Refuse a table whose columns are not those of the contract."""
     expected = dtypes(TABLES[table])
     unlike = [name for name, kind in expected.items() if recorded.get(name) != kind]
     if unlike:
@@ -195,18 +212,19 @@ def run_ids(out: Address) -> list[str]:
 
 
 def own_runs(out: Address) -> list[str]:
+    """Runs with files of their own, sorted."""
     folders = [name for name in storage.folders_in(join(out, _MARKER)) if name.startswith("run_id=")]
     runs = sorted(unquote(name.removeprefix("run_id=")) for name in folders)
     return runs if is_url(out) else _own(out, runs)
 
 
 def _own(out: Address, among: Iterable[str]) -> list[str]:
-    """Those of these runs that have files of their own."""
+    """The runs of these that have files of their own."""
     return [run for run in among if exists(table_address(out, _MARKER, run))]
 
 
 def packed(out: Address, among: Iterable[str]) -> dict[str, packs.PackedRun]:
-    """Those of these runs that are read from packs, in order."""
+    """The runs of these that are read from packs, in order."""
     places = packs.find(out, among)
     # A store lists all of them as fast as it answers for a few.
     own = set(own_runs(out) if is_url(out) and len(places) > 1 else _own(out, places))
@@ -323,4 +341,5 @@ def write_vehicle(out: Address, vehicle: Vehicle) -> None:
 
 
 def folder_name(run_id: str) -> str:
+    """The hive partition of a run."""
     return f"run_id={file_name(run_id)}"

@@ -52,7 +52,7 @@ def names(sql: str, name: str) -> bool:
 
 
 def answered(these: Iterable[View], tables: Mapping[str, pl.LazyFrame]) -> dict[str, pl.LazyFrame]:
-    """Each view over the tables and the views before it, by name."""
+    """The views by name, each over the tables and the views before it."""
     known = dict(tables)
     found: dict[str, pl.LazyFrame] = {}
     for view in these:

@@ -36,6 +36,7 @@ def with_progress(items: Collection[T]) -> Iterator[T]:
 
 
 def tell(done: int, total: int) -> None:
+    """Report progress to whoever waits for it."""
     if (progress := _PROGRESS.get()) is not None:
         progress(done, total)
 
@@ -51,7 +52,7 @@ def watched(progress: Callable[[int, int], None] | None) -> Iterator[None]:
 
 
 def each(function: Callable[[T], R], tasks: Sequence[T], jobs: int) -> Iterator[R]:
-    """As `mapped`, one result after the other as soon as it and those before it are there."""
+    """Results as of `mapped`, one after the other as soon as it and those before it are there."""
     workers = min(jobs, len(tasks))
     if workers <= 1:
         yield from map(function, tasks)

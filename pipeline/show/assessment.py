@@ -64,17 +64,17 @@ def for_reading(tables: dict[str, pl.DataFrame]) -> dict[str, pl.DataFrame]:
 
 
 def figures_for_reading(figures: pl.DataFrame) -> dict[str, pl.DataFrame]:
-    """Per solution: `figure, value, low, high, unit, source`; low and high are exact two-sided 95 % bounds."""
+    """Figures per solution: `figure, value, low, high, unit, source`; bounds are exact, two-sided, 95 %."""
     return {str(row["solution"]): _figures(row) for row in figures.iter_rows(named=True)}
 
 
 def _figures(row: Mapping[str, Any]) -> pl.DataFrame:
     bounds = bounds_of(row)
-    beside = {"solution", *(name for name in row if re.search("_(low|high)(_|$)", name))}
+    not_shown = {"solution", *(name for name in row if re.search("_(low|high)(_|$)", name))}
     rows = [
         (name, value, *(row.get(bound) for bound in bounds.get(name, ("", ""))), *_unit_and_source(name))
         for name, value in row.items()
-        if name not in beside
+        if name not in not_shown
     ]
     kinds = {"figure": pl.String, "value": pl.Float64, "low": pl.Float64, "high": pl.Float64}
     return pl.DataFrame(rows, schema={**kinds, "unit": pl.String, "source": pl.String}, orient="row", strict=False)

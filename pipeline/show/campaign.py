@@ -13,7 +13,7 @@ from pipeline.results.outcome import CampaignSummary, RunOutcome
 from pipeline.show.terminal import duration_text
 from schemas.enums import RunStatus, RunVerdict
 from schemas.errors import visible
-from schemas.words import accepted_words, beside_words, remedy_words, say
+from schemas.words import accepted_words, remedy_words, say, verdict_figures_words
 
 _WORST_FIRST = {"unsafe": 0, "failed": 1, "unproven": 2, "safe": 3}
 
@@ -23,8 +23,8 @@ def outcome_line(outcome: RunOutcome) -> str:
     how = "skipped, " if outcome.skipped else ""
     word = word_of(outcome.verdict)
     status = outcome.status.value
-    beside = "" if outcome.status is RunStatus.OK or status == word else f", {status}"
-    text = f"{outcome.run_id}: {how}{word}{beside}"
+    status_words = "" if outcome.status is RunStatus.OK or status == word else f", {status}"
+    text = f"{outcome.run_id}: {how}{word}{status_words}"
     if outcome.error:
         text += f": {outcome.error}"
     elif not outcome.skipped:
@@ -37,15 +37,15 @@ def outcome_line(outcome: RunOutcome) -> str:
 def summary_line(summary: CampaignSummary) -> str:
     """A campaign in one line, its verdict first."""
     counts = [f"{summary.count(status)} {status.value}" for status in RunStatus]
-    beside = f"; {beside_words(figures)}" if (figures := summary.beside()) else ""
-    text = f"{summary.head}{beside}; {len(summary.outcomes)} of {summary.planned} runs: " + ", ".join(counts)
+    figures_words = f"; {verdict_figures_words(figures)}" if (figures := summary.verdict_figures()) else ""
+    text = f"{summary.head}{figures_words}; {len(summary.outcomes)} of {summary.planned} runs: " + ", ".join(counts)
     if summary.skipped:
         text += f" ({summary.skipped} of them complete before)"
     return f"{text}; {duration_text(summary.seconds)}"
 
 
 def ending_rows(summary: CampaignSummary) -> pl.DataFrame:
-    """What a person reads when a campaign has ended, the worst run first: verdict, figures beside it, why, faults."""
+    """What a person reads when a campaign has ended, the worst run first: verdict, figures, why, faults."""
     ranked = sorted(summary.outcomes, key=lambda outcome: (_WORST_FIRST[word_of(outcome.verdict)], outcome.run_id))
     names = ("verdict", "run_id", "accepted", "available", "margin", "why", "faults")
     rows = [
@@ -65,7 +65,7 @@ def _outcome_figures(outcome: RunOutcome) -> tuple[str, str, str]:
 
 
 def remedy_lines(summary: CampaignSummary, **places: str) -> list[str]:
-    """Per remedy how many runs it would mend, and the command for the worst of them; what gains most time first.
+    """How many runs each remedy would mend, and the command for the worst; what gains most time first.
 
     `places`: paths as the user named them.
     """

@@ -29,7 +29,7 @@ class Kind(Enum):
 
 
 def kind_at(path: Address) -> Kind:
-    """By names alone. Raises `UsageError` where nothing is, and nothing of these."""
+    """Kind of what is at a path, by names alone. Raises `UsageError` where nothing is, and nothing of these."""
     if not files.exists(path):
         raise UsageError("does not exist", place=redacted(str(path)))
     names = set(files.list_dir(path)) if files.is_dir(path) else set()

@@ -64,6 +64,7 @@ def _piece_features(result: LineResult) -> list[dict[str, object]]:
 
 
 def _balise_features(result: LineResult) -> list[dict[str, object]]:
+    """The balises of proposals, as points of a map."""
     balises = result.balises
     points = _coordinates(result, balises["netelement_id"], floats(balises, "measure_m")).tolist()
     return [
@@ -110,6 +111,7 @@ def line_page(result: LineResult) -> str:
 
 
 def _tiles(pieces: pl.DataFrame) -> str:
+    """Tiles with the lengths of suitable, unsuitable and unknown track."""
     tones = {PieceClass.SUITABLE: "good", PieceClass.UNSUITABLE: "bad", PieceClass.UNKNOWN: "doubt"}
     rows = []
     for side in LineDirection:
@@ -138,6 +140,7 @@ def _list(texts: Sequence[str]) -> str:
 
 
 def _key() -> str:
+    """What the signs of the strips mean, for people."""
     words = ", ".join(f"{sign} {cause.value.replace('_', ' ')}" for cause, sign in SIGNS.items())
     return (
         '<p class="keys">Kilometres count from the begin of each line. Upper lane: travel with them, lower: against '
@@ -147,7 +150,7 @@ def _key() -> str:
 
 
 def _strips(result: LineResult, passed: pl.DataFrame) -> list[str]:
-    """Of all net elements that were passed, with the balises of the first proposal."""
+    """Strips of all net elements that were passed, with the balises of the first proposal."""
     if passed.is_empty():
         return ['<p class="none">Nothing is drawn: no run says anything of any piece.</p>']
     pieces = result.pieces.filter(pl.col("netelement_id").is_in(passed["netelement_id"].unique().implode()))

@@ -68,7 +68,7 @@ def lines_of(lengths_m: Mapping[str, float], links: pl.DataFrame) -> list[Line]:
 
 
 def _neighbours(lengths_m: Mapping[str, float], links: pl.DataFrame) -> dict[tuple[str, int], list[tuple[str, int]]]:
-    """Per end of a net element the ends that it is linked to, in the order of the survey."""
+    """Ends that each end of a net element is linked to, in the order of the survey."""
     usable = links.filter(pl.col("navigability").cast(pl.String) != Navigability.NONE.value)
     beyond: dict[tuple[str, int], list[tuple[str, int]]] = {}
     for a, end_a, b, end_b in usable.select("netelement_a", "position_a", "netelement_b", "position_b").iter_rows():
@@ -86,6 +86,7 @@ def _line_from(
     beyond: Mapping[tuple[str, int], list[tuple[str, int]]],
     taken: set[str],
 ) -> Line:
+    """A line of net elements, from one of its ends on."""
     stretches: list[Stretch] = []
     following: tuple[str, int] | None = (start, entered)
     begin_m = 0.0
@@ -108,6 +109,7 @@ def strips(pieces: pl.DataFrame, links: pl.DataFrame, balises: pl.DataFrame) -> 
 
 
 def _strip(number: int, line: Line, pieces: Mapping[str, pl.DataFrame], balises: Mapping[str, pl.DataFrame]) -> str:
+    """The strip of one line."""
     names = line[0].name if len(line) == 1 else f"{line[0].name} to {line[-1].name}"
     total_m = line[-1].begin_m + line[-1].length_m
     first = pieces[line[0].name].row(0, named=True)
@@ -132,9 +134,11 @@ class _Window:
     top: float
 
     def x(self, at_m: float) -> float:
+        """Where a place is drawn; places outside at the edge."""
         return _LEFT + (min(max(at_m, self.begin_m), self.end_m) - self.begin_m) * self.scale
 
     def holds(self, at_m: float) -> bool:
+        """Whether the strip shows a place."""
         return self.begin_m <= at_m < self.end_m or at_m == self.end_m
 
 
@@ -161,6 +165,7 @@ def _row(
 
 
 def _axis(window: _Window) -> Iterator[str]:
+    """The axis of kilometres."""
     width_km = _WIDTH / window.scale / 1000.0
     step_km = next((step for step in _TICKS_KM if width_km / step <= 12), _TICKS_KM[-1])
     base = window.top + 72
@@ -184,6 +189,7 @@ def _named(stretch: Stretch, window: _Window) -> Iterator[str]:
 
 
 def _balises(balises: pl.DataFrame, stretch: Stretch, window: _Window) -> Iterator[str]:
+    """The balises of a stretch."""
     for at_m, kind in balises.select("measure_m", "kind").iter_rows():
         if window.holds(stretch.at(at_m)):
             sign = "|" if kind == BaliseKind.VIRTUAL.value else "‖"

@@ -32,6 +32,7 @@ class CampaignWatch:
     """Counts the runs of a campaign, and shows those that are not ok and what somebody should see to."""
 
     def begin(self, runs: int, out: str) -> None:
+        """Say that so many runs are to be replayed into `out`."""
         self.total = runs
         self.done = self.failed = self.skipped = 0
         self.since_s = time.monotonic()
@@ -48,6 +49,7 @@ class CampaignWatch:
         self.noted(visible(f"{run_id}: its worker died at attempt {attempt}; tried again"))
 
     def finished(self, outcome: RunOutcome) -> None:
+        """One more run has ended."""
         self.done += 1
         self.failed += outcome.status is not RunStatus.OK
         self.skipped += outcome.skipped
@@ -78,7 +80,7 @@ class CampaignWatch:
         return ", ".join([f"{self.done}/{self.total} runs", *self.parts(under_way)])
 
     def parts(self, under_way: UnderWay = ()) -> list[str]:
-        """What is said beside how many are done, what matters most first."""
+        """What is said with how many are done, what matters most first."""
         parts = [f"{self.failed} failed or partial"]
         if self.skipped:
             parts.append(f"{self.skipped} skipped")
@@ -123,11 +125,13 @@ class LineWatch(CampaignWatch):
         self._said_s = time.monotonic()
 
     def look(self, under_way: UnderWay) -> None:
+        """Say where the campaign stands, every so often."""
         if time.monotonic() - self._said_s >= _SAY_S:
             self._said_s = time.monotonic()
             self.progress(under_way)
 
     def progress(self, under_way: UnderWay) -> None:
+        """Say where the campaign stands now."""
         self.noted(self.line(under_way))
 
     def noted(self, text: str) -> None:
@@ -136,6 +140,7 @@ class LineWatch(CampaignWatch):
             print(text, file=self._stream, flush=True)
 
     def end(self, summary: CampaignSummary) -> None:
+        """Say where it ended."""
         self.progress(())
 
 
@@ -143,13 +148,16 @@ class JsonWatch(LineWatch):
     """JSON lines for programs: `run` as each run ends, `lost` with each worker that dies, `progress` in between."""
 
     def begin(self, runs: int, out: str) -> None:
+        """Say that it begins."""
         super().begin(runs, out)
         self.progress(())
 
     def progress(self, under_way: UnderWay) -> None:
+        """Say where the campaign stands now."""
         self._say("progress", **self.figures(under_way))
 
     def counted(self, outcome: RunOutcome) -> None:
+        """Say what became of a run."""
         names = (
             *("run_id", "status", "error", "skipped", "attempts", "hazards", "missed_detections"),
             *(
@@ -166,9 +174,11 @@ class JsonWatch(LineWatch):
         self._say("run", **fields | {"seconds": round(outcome.seconds, 3)} | self.figures())
 
     def lost(self, run_id: str, attempt: int) -> None:
+        """Say that the worker of a run died."""
         self._say("lost", run_id=run_id, attempt=attempt)
 
     def noted(self, text: str) -> None:
+        """Say a sentence."""
         self._say("note", text=text)
 
     def _say(self, event: str, **fields: object) -> None:
@@ -179,6 +189,7 @@ class BarWatch(CampaignWatch):
     """A progress bar on a terminal."""
 
     def begin(self, runs: int, out: str) -> None:
+        """Show a bar."""
         # Takes long to load, and a pipe has no bar.
         from rich.console import Console
         from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
@@ -190,14 +201,17 @@ class BarWatch(CampaignWatch):
         self._bar.start()
 
     def look(self, under_way: UnderWay) -> None:
+        """Bring the bar up to date."""
         room = self._bar.console.width - _BAR - _COUNTS
         text = as_fits(self.parts(under_way), room)
         self._bar.update(self._task, completed=self.done, description=text)
 
     def noted(self, text: str) -> None:
+        """Print a sentence above the bar."""
         self._bar.console.print(text, markup=False, highlight=False)
 
     def end(self, summary: CampaignSummary) -> None:
+        """Take the bar away."""
         # The terminal may be closed.
         with contextlib.suppress(OSError):
             self.look(())
@@ -208,17 +222,20 @@ class LogWatch(CampaignWatch):
     """`OUT/replay.log`: every run with its time; an object store gets it when the campaign ends."""
 
     def begin(self, runs: int, out: str) -> None:
+        """Begin the log file of the campaign."""
         super().begin(runs, out)
         self._place = str(join(out, "replay.log"))
         self._lines = list[str]()
         self.noted(f"{SOFTWARE}: {runs} runs")
 
     def counted(self, outcome: RunOutcome) -> None:
+        """Write what became of a run, with the trace of a defect."""
         self.noted(outcome_line(outcome))
         if outcome.trace:
             self.noted(redacted(outcome.trace))
 
     def noted(self, text: str) -> None:
+        """Write a line with its time."""
         line = f"{datetime.now(UTC):%Y-%m-%dT%H:%M:%SZ} {text}\n"
         if is_url(self._place):
             self._lines.append(line)
@@ -227,6 +244,7 @@ class LogWatch(CampaignWatch):
             log.write(line)
 
     def end(self, summary: CampaignSummary) -> None:
+        """Write the summary; to an object store all lines at once."""
         self.noted(summary_line(summary))
         if is_url(self._place):
             storage.write_bytes(self._place, "".join(self._lines).encode())
@@ -266,7 +284,7 @@ def show_summary(
 
 def summary_answer(summary: CampaignSummary, out: str) -> dict[str, object]:
     """The same for programs."""
-    head = {"verdict": summary.head.word, "verdicts": summary.head.counts(), **summary.beside()}
+    head = {"verdict": summary.head.word, "verdicts": summary.head.counts(), **summary.verdict_figures()}
     figures = {"planned": summary.planned, "left": summary.left, "skipped": summary.skipped}
     return {**head, **figures, "seconds": round(summary.seconds, 3), "out": out, "runs": outcome_rows(summary)}
 

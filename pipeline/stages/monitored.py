@@ -12,17 +12,18 @@ import numpy as np
 import polars as pl
 
 from pipeline.stages.alignment.align import align, odometer_at
+from pipeline.stages.epochs.monitored import MonitoredEpochs
 from pipeline.stages.epochs.verdicts import Verdicts
 from pipeline.stages.evidence import TrainEvidence
 from pipeline.stages.judge.epochs import direction_by_evidence
-from pipeline.stages.judge.judgement import JudgeInput, Solution
+from pipeline.stages.judge.judgement import Solution
 from pipeline.stages.lds.run import LdsResult, run_lds
 from pipeline.stages.matching import Match
 from pipeline.stages.monitors.bank import MonitorBank
 from pipeline.stages.monitors.single import NO_OTHER_SOLUTION, WITHOUT_MEMORY, MonitorInput, on_path_of
 from pipeline.stages.odometry import Odometry
 from pipeline.stages.prepare import PreparedRun
-from schemas.arrays import Ints, times_ns
+from schemas.arrays import times_ns
 from schemas.enums import NotEvaluated
 from schemas.frozen import frozen
 from schemas.stages import AlignedEpochs
@@ -62,14 +63,28 @@ class MonitoredSolution:
 def monitor_solution(
     prepared: PreparedRun, solution: str, matches: Mapping[str, Match], evidence: TrainEvidence
 ) -> MonitoredSolution:
-    """Align one matched solution with the odometer, monitor it, detect balises."""
+    """Align one matched solution with the odometer, monitor it, detect balises.
+
+    Args:
+        prepared: the run, its site and its odometer.
+        solution: the name of the solution.
+        matches: paths of this solution, and of the one that the channel monitor compares it with.
+        evidence: where the train was; used for the direction of travel alone, and only without an odometer.
+
+    Returns:
+        All that the train made of the solution.
+
+    Source:
+        DOMAIN sections 3 and 4.
+    """
     config = prepared.config
     matched = matches[solution]
     odometry = None if prepared.odometry is None else prepared.odometry.oriented(matched.odometer_sign)
     aligned = align(matched.epochs, odometry, prepared.vehicle, config)
     if odometry is None:
         # A balise valid in one direction means that of the train, not of one step of the positions (DOMAIN section 4).
-        aligned = replace(aligned, direction=_direction(prepared, solution, aligned, matched, evidence))
+        direction = direction_by_evidence(aligned, matched.path, evidence, prepared.vehicle, config)
+        aligned = replace(aligned, direction=direction)
     channel = _other_solution(prepared, solution, aligned, matches)
     # What is made of the positions cannot say that they are right (DOMAIN section 5.0).
     blind_along = NotEvaluated.ODOMETER_OF_GNSS if odometry is not None and odometry.of_gnss else None
@@ -82,19 +97,10 @@ def monitor_solution(
     found = {**lds.linking, **bank.verdicts()}
     if blind_along is not None:
         found |= {name: found[name].without_passes(blind_along) for name in _AGAINST_ODOMETER}
-    verdicts = pl.DataFrame([column for name, one in found.items() for column in one.columns(name)])
-    with_monitors = pl.concat([aligned.table, lds.epochs.drop("t"), verdicts], how="horizontal")
+    epochs = MonitoredEpochs(**aligned.columns(), **lds.epochs.columns(), verdicts=found)
     fixes = prepared.fixes(solution)
-    replayed = Solution(solution, fixes, with_monitors, lds.crossings, lds.passages, balises, matched.path)
+    replayed = Solution(solution, fixes, epochs, lds.crossings, lds.passages, balises, matched.path)
     return MonitoredSolution(prepared, replayed, matched, aligned, odometry, channel, singles, bank, lds)
-
-
-def _direction(
-    prepared: PreparedRun, solution: str, aligned: AlignedEpochs, matched: Match, evidence: TrainEvidence
-) -> Ints:
-    nothing = pl.DataFrame()
-    unjudged = Solution(solution, prepared.fixes(solution), aligned.table, nothing, nothing, nothing, matched.path)
-    return direction_by_evidence(JudgeInput(unjudged, evidence, None, prepared.vehicle, prepared.config))
 
 
 def _other_solution(
@@ -112,8 +118,8 @@ def _without_memory(
 ) -> dict[str, Verdicts]:
     named = prepared.config.monitors.channel_reference
     absent = NO_OTHER_SOLUTION if named in (None, solution) else NotEvaluated.OTHER_NOT_RECORDED
-    seen = MonitorInput(aligned, prepared.ranges(solution), channel, absent, prepared.config)
-    return {name: monitor(seen) for name, monitor in WITHOUT_MEMORY.items()}
+    given = MonitorInput(aligned, prepared.ranges(solution), channel, absent, prepared.config)
+    return {name: monitor(given) for name, monitor in WITHOUT_MEMORY.items()}
 
 
 def _reads_on_odometer(

@@ -17,6 +17,7 @@ from pipeline.stages.clean.clean import (
     require_two_times,
 )
 from pipeline.stages.evidence import TrainEvidence, evidence_of
+from pipeline.stages.evidence.anchors import read_anchors
 from pipeline.stages.evidence.gathering import on_time, without_frozen
 from pipeline.stages.follows import NOT_TESTED, Follows, follows_positions
 from pipeline.stages.matching import Match, match
@@ -63,6 +64,7 @@ class PreparedRun:
         return self._fixes[solution]
 
     def ranges(self, solution: str) -> pl.DataFrame | None:
+        """Satellites of one solution, or None."""
         satellites = self.run.satellites
         return None if satellites is None else satellites.filter(pl.col("solution") == solution)
 
@@ -81,8 +83,10 @@ class PreparedRun:
         moving = without_frozen(recorded, self.odometers, self.config.hazards)
         reference = reference_stretches(moving, pieces, network.track.index, self.config)
         reads = on_time(self.run.balise_reads, self.vehicle.reads_latency_s)
-        balises = self.site.balises
-        return evidence_of(reference, reads, balises, self.odometers, network, self.vehicle, self.config)
+        recorders = [
+            read_anchors(reads, self.site.balises, network.track, self.config.hazards),
+        ]
+        return evidence_of(reference, recorders, self.odometers, network, self.vehicle, self.config)
 
     def follows_of(self, solution: str) -> Follows:
         """Whether the odometer of the LDS is made of the positions of this solution."""
@@ -90,11 +94,12 @@ class PreparedRun:
 
     @property
     def provenance(self) -> Provenance:
+        """Which inputs and settings the results are made of."""
         return provenance(self.run, self.site, self.vehicle, self.config)
 
     @property
     def figures_from(self) -> VehicleFigures:
-        """Where scale and latency come from (DOMAIN section 5.4)."""
+        """Origin of scale and latency, for people (DOMAIN section 5.4)."""
         if self.odometry is None:
             return VehicleFigures.NONE
         in_file = self.vehicle.odometer_scale is not None and self.vehicle.gnss_latency_s is not None
@@ -104,7 +109,21 @@ class PreparedRun:
 def prepare(
     run: RunLog, site: Site, vehicle: Vehicle, config: Configuration, clock_advice: ClockAdvice = no_advice
 ) -> PreparedRun:
-    """`clock_advice` helps where the recorders' times do not meet."""
+    """Put the streams of a run in order, make its odometers, and test whether they are made of the positions.
+
+    Args:
+        run: the run as recorded.
+        site: track, links, balises and route.
+        vehicle: what is known of the vehicle.
+        config: the configuration.
+        clock_advice: what would move recorders of different times to one journey, for the error's remedy.
+
+    Returns:
+        The run in order, with its odometers; solutions are matched when asked for.
+
+    Raises:
+        InputError: nothing can be replayed: no two times, none in common, longer than a journey.
+    """
     recorded, counts = clean(run, config, clock_advice)
     journey = of_the_journey(recorded)
     sensors = () if journey.odometer is None else (journey.odometer, *journey.other_odometers)
@@ -148,5 +167,6 @@ def require_independent_odometer(prepared: PreparedRun) -> None:
 
 
 def _origin_words(odometry: Odometry) -> str:
+    """Where the odometry comes from, for people."""
     follows = ", but it follows the positions" if odometry.follows_gnss else ""
     return f"{odometry.origin}{follows}"

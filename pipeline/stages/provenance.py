@@ -21,6 +21,7 @@ class Provenance:
 
 
 def provenance(run: RunLog, site: Site, vehicle: Vehicle, config: Configuration) -> Provenance:
+    """Which log, site, settings and program results are made of."""
     return Provenance(
         config_digest=digest_of(config, vehicle),
         input_digest=input_digest(run, site.digest),

@@ -62,5 +62,5 @@ def join(path: Address, name: str) -> Address:
 
 
 def is_geojson(address: Address) -> bool:
-    """By its name: a network as registers of infrastructure export it, net elements and net relations in one file."""
+    """Whether a name is that of a network as registers of infrastructure export it, all in one file."""
     return name_of(address).lower().endswith(".geojson")

@@ -47,11 +47,13 @@ class Budget:
         self._begun_s = time.monotonic()
 
     def take_file(self) -> None:
+        """Count one more file; raises where there are too many."""
         self._files += 1
         if self._files > self._config.unpacked_files_limit:
             raise self._spent("holds too many files", "unpacked_files_limit", "files")
 
     def take(self, count: int) -> None:
+        """Count unpacked bytes; raises where size, ratio or time is beyond its limit."""
         self._bytes += count
         if self._bytes > self._most:
             raise self._spent("unpacks to too much", "unpacked_limit_mib", "MiB")

@@ -76,7 +76,7 @@ _FIRST = tuple(f"{PREFIX}{key}" for key in ("table", "run_id", "contract", "soft
 
 
 def _kind_text(kind: pl.DataType) -> str:
-    """As the dictionary says it."""
+    """Kind of a value, as the dictionary says it."""
     if isinstance(kind, pl.Enum):
         return "enum " + " ".join(kind.categories)
     return f"list of {_kind_text(kind.inner)}" if isinstance(kind, pl.List) else str(kind)  # type: ignore[arg-type]

@@ -20,13 +20,27 @@ from schemas.errors import InputError, OutputError, UsageError
 
 
 def reach(address: Address) -> None:
-    """Raises `InputError` where the store of an address does not answer; local paths answer always."""
+    """Ask whether the store of an address answers.
+
+    Args:
+        address: path, or address in an object store.
+
+    Raises:
+        InputError: the store does not answer; local paths answer always.
+    """
     if is_url(address):
         on_store(address, kind_of, kind=InputError)
 
 
 def folders_in(address: Address) -> list[str]:
-    """Names of the folders in a folder, sorted; none where it does not exist."""
+    """Names of the folders in a folder, sorted; none where it does not exist.
+
+    Args:
+        address: path, or address in an object store.
+
+    Returns:
+        Names, without what lies above.
+    """
     if not is_url(address):
         try:
             return sorted(entry.name for entry in os.scandir(address) if entry.is_dir())
@@ -39,7 +53,15 @@ def folders_in(address: Address) -> list[str]:
 
 
 def sizes(folder: Address, name: str) -> dict[str, int]:
-    """The size [bytes] of `folder/*/name`, by the folder between."""
+    """The size of `folder/*/name`.
+
+    Args:
+        folder: path or address.
+        name: name of the file in each folder.
+
+    Returns:
+        Sizes [bytes] by the name of the folder between.
+    """
     if is_url(folder):
         listed = on_store(folder, lambda store, path: store.find(path, detail=True))
         return {place.split("/")[-2]: info["size"] for place, info in listed.items() if place.endswith(f"/{name}")}
@@ -48,7 +70,14 @@ def sizes(folder: Address, name: str) -> dict[str, int]:
 
 
 def files_below(address: Address) -> list[str]:
-    """Every file in a folder and in those below, from that folder on, with slashes; sorted."""
+    """Every file in a folder and in those below, from that folder on, with slashes; sorted.
+
+    Args:
+        address: path, or address in an object store.
+
+    Returns:
+        Names relative to the folder.
+    """
     if not is_url(address):
         walked = os.walk(address, onerror=_raise_listing)
         paths = (Path(folder, name) for folder, _, names in walked for name in names)
@@ -71,7 +100,17 @@ def _names_below(store: Any, place: str, before: str) -> Iterator[str]:
 
 
 def require_match(name: str) -> list[Address]:
-    """What a run, a folder or a pattern names; an address as it is. Raises `UsageError` where that is nothing."""
+    """What a run, a folder or a pattern names; an address as it is.
+
+    Args:
+        name: path, folder, pattern or address.
+
+    Returns:
+        The addresses, at least one.
+
+    Raises:
+        UsageError: nothing matches.
+    """
     if matches := _matches(name):
         return matches
     expected = "RUN.mcap, a run folder, a folder of runs or a glob"
@@ -89,7 +128,14 @@ def _matches(name: str) -> list[Address]:
 
 
 def glob_remote(pattern: str) -> list[Address]:
-    """Addresses that match a glob in an object store, sorted."""
+    """Addresses that match a glob in an object store, sorted.
+
+    Args:
+        pattern: address with `*`, `?` or `[...]`.
+
+    Returns:
+        The addresses.
+    """
     return on_store(
         pattern,
         lambda store, path: sorted(store.unstrip_protocol(match) for match in _globbed(store, path)),
@@ -120,7 +166,14 @@ def _folders_below(store: Any, place: str) -> Iterator[str]:
 
 
 def read_many(addresses: list[str]) -> dict[str, bytes]:
-    """Contents of those of these files that exist, in one go where they lie in a store."""
+    """Contents of those of these files that exist, in one go where they lie in a store.
+
+    Args:
+        addresses: files, local or in object stores.
+
+    Returns:
+        Bytes by address, without those that do not exist.
+    """
     if not addresses or not is_url(addresses[0]):
         contents = {address: content_of(address) for address in addresses}
         return {address: content for address, content in contents.items() if content is not None}
@@ -138,7 +191,14 @@ def read_many(addresses: list[str]) -> dict[str, bytes]:
 
 
 def content_of(address: Address) -> bytes | None:
-    """The content of a file; none where it does not exist."""
+    """The content of a file; none where it does not exist.
+
+    Args:
+        address: path, or address in an object store.
+
+    Returns:
+        The bytes, or None.
+    """
     if is_url(address):
         return read_many([str(address)]).get(str(address))
     try:
@@ -154,6 +214,16 @@ def local_copy(address: Address, version: str | None = None) -> Iterator[Path]:
     """A local path with the content of the address, of a folder the files directly in it; removed afterwards.
 
     What came is held against names, sizes and digests that the store lists, and the list against `version`, if given.
+
+    Args:
+        address: a file or folder, local or in an object store.
+        version: what `version` gave when the content was listed; None: not held against it.
+
+    Returns:
+        A context with the path.
+
+    Raises:
+        InputError: the content is not what the store lists, or no longer that version.
     """
     note(address)
     if not is_url(address):
@@ -184,7 +254,7 @@ def _fetched(store: Any, path: str, folder: Path, version: str | None) -> Path:
 
 
 def _copies(listing: Listing, path: str, target: Path) -> dict[str, Path]:
-    """Where the object goes, or each of those in the folder."""
+    """Places that the object goes to, or each of those in the folder."""
     if path in listing:
         return {path: target}
     target.mkdir()

@@ -24,10 +24,12 @@ _LEAST_PART = 262_144
 
 
 def exists(path: Address) -> bool:
+    """Whether something lies at an address."""
     return _either(path, Path.exists, lambda store, inner: bool(kind_of(store, inner)))
 
 
 def is_dir(path: Address) -> bool:
+    """Whether a folder lies at an address."""
     return _either(path, Path.is_dir, lambda store, inner: kind_of(store, inner) == "directory")
 
 
@@ -47,6 +49,7 @@ def open_binary(path: Address) -> IO[bytes]:
 
 
 def read_bytes(path: Address) -> bytes:
+    """The content of a file, local or in a store."""
     with local_copy(path) as file:
         return _local(file, lambda present: _regular(present).read_bytes())
 
@@ -66,19 +69,24 @@ class _Parts(io.RawIOBase):
         self._at = 0
 
     def readable(self) -> bool:
+        """Whether it can be read, as every file that is read."""
         return True
 
     def seekable(self) -> bool:
+        """Any part can be read first."""
         return True
 
     def seek(self, offset: int, whence: int = io.SEEK_SET) -> int:
+        """Go to a place; the new place."""
         self._at = offset + {io.SEEK_SET: 0, io.SEEK_CUR: self._at, io.SEEK_END: self._size}[whence]
         return self._at
 
     def tell(self) -> int:
+        """The place."""
         return self._at
 
     def readinto(self, buffer: Any) -> int:
+        """Fill a buffer from the store; how many bytes came."""
         end = min(self._at + len(buffer), self._size)
         if end <= self._at:
             return 0
@@ -103,6 +111,7 @@ def _regular(path: Path) -> Path:
 
 
 def size_of(path: Address) -> int:
+    """Size of a file [bytes]."""
     return _either(path, lambda file: file.stat().st_size, lambda store, inner: int(store.size(inner)))
 
 

@@ -15,7 +15,14 @@ from schemas.errors import InputError
 
 
 def version(address: Address) -> str | None:
-    """What changes with the content of a file, or of the files in a folder; none where that is not known."""
+    """What changes with the content of a file, or of the files in a folder; none where that is not known.
+
+    Args:
+        address: path, or address in an object store.
+
+    Returns:
+        A text that changes with the content, or None.
+    """
     if not is_url(address):
         return repr(signature(Path(address))) if Path(address).exists() else None
     return version_in(on_store(address, objects_at, kind=InputError))
@@ -28,9 +35,14 @@ class FileDigest(NamedTuple):
 
 
 def file_digests(path: Path, known: str = "") -> tuple[FileDigest, ...]:
-    """A file, or the files directly in a folder, in order of their names.
+    """Digests of a file, or of the files directly in a folder, in order of their names.
 
-    `known`: the SHA-256 of the file, if it has been read already; of no use for a folder.
+    Args:
+        path: a file or a folder.
+        known: the SHA-256 of the file, if it has been read already; of no use for a folder.
+
+    Returns:
+        Name, size and SHA-256 of each.
     """
     if path.is_dir():
         files = [file for file in sorted(path.iterdir()) if file.is_file()]
@@ -39,7 +51,14 @@ def file_digests(path: Path, known: str = "") -> tuple[FileDigest, ...]:
 
 
 def digest_of_files(files: Iterable[FileDigest]) -> str:
-    """SHA-256 over names and contents."""
+    """SHA-256 over names and contents.
+
+    Args:
+        files: names and digests.
+
+    Returns:
+        64 hexadecimal digits.
+    """
     return hashlib.sha256("".join(f"{file.name} {file.sha256}\n" for file in files).encode()).hexdigest()
 
 
@@ -60,7 +79,14 @@ class FileState(NamedTuple):
 
 
 def signature(path: Path) -> tuple[FileState, ...]:
-    """The state of a file, or of each file directly in a folder."""
+    """The state of a file, or of each file directly in a folder.
+
+    Args:
+        path: a local file or folder.
+
+    Returns:
+        Size and times of each file, in order of their names.
+    """
     if path.is_dir():
         with os.scandir(path) as entries:
             stats = sorted((entry.name, entry.stat()) for entry in entries if entry.is_file())

@@ -32,6 +32,7 @@ class Noted:
         self._scratch: list[str] = []
 
     def note(self, place: Address) -> None:
+        """Remember the state of a place that a step reads."""
         if self._around is not None:
             self._around.note(place)
         text = str(place) if is_url(place) else str(Path(place).absolute())
@@ -45,7 +46,7 @@ class Noted:
         self._scratch.append(f"{folder.absolute()}{os.sep}")
 
     def digests(self) -> dict[str, str]:
-        """By place what it held when it was read; `NO_DIGEST` where that is not known."""
+        """Digest of each place's content when it was read; `NO_DIGEST` where that is not known."""
         return {
             place: digest_now(place) if state == _state(place) else NO_DIGEST for place, state in self._states.items()
         }

@@ -56,9 +56,9 @@ def on_store(address: Address, operation: Callable[[Any, str], T], kind: type[Ba
                 raise _absent(address) from None
             reason = _words_of(error, reason)
             pause_s = min(_FIRST_PAUSE_S * 2**attempt, _LONGEST_PAUSE_S)
-            silent = _may_pass(error) and watched.silence_s + pause_s > limit_s
-            if silent or attempt + 1 >= _tries(error):
-                what = "" if isinstance(error, AlteredError) else _failure(limit_s if silent else None)
+            unanswered = _may_pass(error) and watched.silence_s + pause_s > limit_s
+            if unanswered or attempt + 1 >= _tries(error):
+                what = "" if isinstance(error, AlteredError) else _failure(limit_s if unanswered else None)
                 raise _refused(address, what + reason, kind) from None
             time.sleep(pause_s)
     raise AssertionError("the last attempt returns or raises")
@@ -110,9 +110,11 @@ class _PatientStore:
 
     @property
     def silence_s(self) -> float:
+        """Time for which nothing has arrived [s]."""
         return time.monotonic() - self._since_s
 
     def arrived(self, *_: object) -> None:
+        """Something has arrived now."""
         self._since_s = time.monotonic()
 
     def __getattr__(self, name: str) -> Any:
@@ -188,8 +190,10 @@ def _absent(address: Address) -> InputError:
     )
 
 
-def _failure(silent_s: float | None) -> str:
-    return "the store refused: " if silent_s is None else f"the store gave no usable answer for {silent_s:g} s: "
+def _failure(unanswered_s: float | None) -> str:
+    return (
+        "the store refused: " if unanswered_s is None else f"the store gave no usable answer for {unanswered_s:g} s: "
+    )
 
 
 def _refused(address: Address, reason: str, kind: type[BaliseError]) -> BaliseError:

@@ -83,6 +83,7 @@ class GroupedWriter:
         )
 
     def add(self, table: pa.Table) -> None:
+        """Take rows; written once they make a row group."""
         self._waiting.append(table)
         self._rows += table.num_rows
         if self._rows >= self._rows_per_group:
@@ -240,7 +241,7 @@ def metadata_in(end: bytes) -> pq.FileMetaData:
 
 
 def without_checksums(content: bytes) -> bool:
-    """Whether some column has no checksum, so that damage to it may stay unseen. Raises `ParquetError`."""
+    """Whether some column has no checksum, so that damage to it may go unnoticed. Raises `ParquetError`."""
     with _reading():
         metadata = pq.read_metadata(pa.BufferReader(content))
         groups = (metadata.row_group(number) for number in range(metadata.num_row_groups) if metadata.num_rows)
@@ -298,7 +299,7 @@ class GroupedFile:
             return self._file.read_row_groups(list(groups), columns=columns).replace_schema_metadata(None)
 
     def rows(self, spans: Sequence[Span], table: pa.Table, groups: Sequence[int]) -> pa.Table:
-        """Of a table that was read of these groups the rows of the spans, which are in order and apart."""
+        """Rows of the spans, which are in order and apart, of a table that was read of these groups."""
         begins = np.cumsum([0, *(self._starts[number + 1] - self._starts[number] for number in groups)])
         before = {number: int(self._starts[number] - begins[place]) for place, number in enumerate(groups)}
         asked = [(span, before[self._groups(span)[0]]) for span in _merge_spans(spans)]

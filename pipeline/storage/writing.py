@@ -29,17 +29,40 @@ _NOT_SYNCED = (errno.EINVAL, errno.ENOTSUP, errno.EBADF, errno.EACCES)
 
 
 def absolute(address: Address) -> str:
-    """The address as a worker with another working directory understands it."""
+    """The address as a worker with another working directory understands it.
+
+    Args:
+        address: path, or address in an object store.
+
+    Returns:
+        An absolute path, or the address as it is.
+    """
     return str(address) if is_url(address) else str(Path(address).absolute())
 
 
 def write_bytes(address: Address, content: bytes) -> None:
-    """Write a file that is there whole or not at all."""
+    """Write a file that is there whole or not at all.
+
+    Args:
+        address: path, or address in an object store.
+        content: the bytes.
+
+    Raises:
+        OutputError: it cannot be written.
+    """
     commit([stage(address, content)])
 
 
 def stage(address: Address, content: bytes) -> tuple[Address, Address]:
-    """Put the content beside its final place (object stores: at it); `commit` gives it its name."""
+    """Put the content next to its final place (object stores: at it); `commit` gives it its name.
+
+    Args:
+        address: path, or address in an object store.
+        content: the bytes.
+
+    Returns:
+        Where the content is, and the final address.
+    """
     if is_url(address):
         on_store(address, lambda store, path: store.pipe_file(path, content))
         return address, address
@@ -52,7 +75,14 @@ def stage(address: Address, content: bytes) -> tuple[Address, Address]:
 
 @contextlib.contextmanager
 def whole_file(path: Path) -> Iterator[IO[bytes]]:
-    """A file to write to that is there under its name when it is whole, and not at all where writing fails."""
+    """A file to write to that is there under its name when it is whole, and not at all where writing fails.
+
+    Args:
+        path: the final path.
+
+    Returns:
+        A context with the open file.
+    """
     temporary = _temporary(path)
     with as_output_error(path), _writing(temporary) as file:
         yield file
@@ -63,6 +93,11 @@ def replace_files(folder: Path, contents: Mapping[str, bytes | None], marker: st
     """Write files of one folder, and remove those without content; the marker goes first and comes last.
 
     So a folder with its marker is whole, whenever somebody looks.
+
+    Args:
+        folder: a local folder.
+        contents: bytes by file name; None removes the file.
+        marker: the file that says that the folder is whole.
     """
     staged: list[tuple[Address, Address]] = []
     try:
@@ -103,7 +138,13 @@ class SweptError(OutputError):
 def commit(staged: list[tuple[Address, Address]]) -> None:
     """Give staged files their names, in order, the last when the others are sure to stay.
 
-    Raises `SweptError` where somebody removed one; whatever fails, nothing stays that has no name yet.
+    Whatever fails, nothing stays that has no name yet.
+
+    Args:
+        staged: pairs of where the content is and its final address.
+
+    Raises:
+        SweptError: somebody removed one of them.
     """
     try:
         _commit(staged)
@@ -141,14 +182,25 @@ def _sync(files: Iterable[Path]) -> None:
 
 
 def discard(staged: list[tuple[Address, Address]]) -> None:
-    """Drop staged files that will not be committed."""
+    """Drop staged files that will not be committed.
+
+    Args:
+        staged: pairs as `stage` yields them.
+    """
     for temporary, final in staged:
         if temporary != final:
             Path(temporary).unlink(missing_ok=True)
 
 
 def unfinished_in(folder: Path | str) -> list[str]:
-    """Names of files in a folder that were being written; none where it does not exist."""
+    """Names of files in a folder that were being written; none where it does not exist.
+
+    Args:
+        folder: path of a folder.
+
+    Returns:
+        File names.
+    """
     with as_output_error(folder):
         try:
             names = os.listdir(folder)  # noqa: PTH208 - of thousands of folders
@@ -158,7 +210,11 @@ def unfinished_in(folder: Path | str) -> list[str]:
 
 
 def remove(address: Address) -> None:
-    """Remove a file; its absence is no error."""
+    """Remove a file; its absence is no error.
+
+    Args:
+        address: path, or address in an object store.
+    """
     if is_url(address):
         _remove_remote(address, lambda store, path: store.rm_file(path))
         return
@@ -168,7 +224,11 @@ def remove(address: Address) -> None:
 
 
 def remove_folder(address: Address) -> None:
-    """Remove a folder with all that is in it; its absence is no error."""
+    """Remove a folder with all that is in it; its absence is no error.
+
+    Args:
+        address: path, or address in an object store.
+    """
     if is_url(address):
         _remove_remote(address, lambda store, path: store.rm(path, recursive=True))
     else:
@@ -176,7 +236,11 @@ def remove_folder(address: Address) -> None:
 
 
 def remove_folders(folders: Sequence[Address]) -> None:
-    """Remove folders that lie in one with all that is in them, so that a power cut does not bring one back."""
+    """Remove folders that lie in one with all that is in them, so that a power cut does not bring one back.
+
+    Args:
+        folders: addresses with one parent.
+    """
     for folder in folders:
         if is_url(folder):
             remove_folder(folder)
@@ -197,7 +261,17 @@ def _remove_remote(address: Address, operation: Callable[[Any, str], None]) -> N
 
 @contextlib.contextmanager
 def as_output_error(address: Address) -> Iterator[None]:
-    """Turn what an operating system or a store raises into one message that names the place."""
+    """Turn what an operating system or a store raises into one message that names the place.
+
+    Args:
+        address: path, or address in an object store.
+
+    Returns:
+        A context in which to write there.
+
+    Raises:
+        OutputError: the system or the store failed.
+    """
     try:
         yield
     except OSError as error:

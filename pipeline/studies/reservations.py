@@ -24,6 +24,7 @@ def sentences(section: str, said: Mapping[str, object]) -> list[str]:
 
 
 def _sentence(section: str, name: str, value: object) -> str:
+    """The sentence of one reservation, from the texts of its section."""
     if isinstance(value, Mapping):
         return say_of(section, name, value)
     return say(section, name, *(value if isinstance(value, tuple) else (value,)))

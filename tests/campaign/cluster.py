@@ -18,6 +18,11 @@ from typing import Any
 ROOT = Path(__file__).parents[2]
 # Each of the processes takes seconds of processor time to start: minutes on a machine that is busy otherwise.
 _START_S = 240.0
+_SURROUNDINGS = {
+    "PYTHONPATH": str(ROOT),
+    "POLARS_MAX_THREADS": "1",
+    "DASK_DISTRIBUTED__WORKER__MULTIPROCESSING_METHOD": "forkserver",
+}
 
 
 class Cluster:
@@ -91,11 +96,11 @@ class Cluster:
 
     def _dask(self, *arguments: str) -> subprocess.Popen[bytes]:
         return subprocess.Popen(
-            [sys.executable, "-m", "dask", *arguments],
+            [sys.executable, "-m", "tests.campaign.nanny" if arguments[0] == "worker" else "dask", *arguments],
             cwd=ROOT,
             stdout=subprocess.DEVNULL,
             stderr=subprocess.DEVNULL,
-            env={**os.environ, "PYTHONPATH": str(ROOT), "POLARS_MAX_THREADS": "1", **self._settings},
+            env={**os.environ, **_SURROUNDINGS, **self._settings},
         )
 
 
@@ -105,20 +110,26 @@ def _state(dask_worker: Any) -> str:
 
 
 def workers_of(pid: int) -> list[int]:
-    """Worker processes of a process; its tracker of semaphores is a child too, but none that does the work."""
+    """Worker processes of a process: spawned, or forked by its server; the tracker of semaphores does no work."""
+    spawned = [child for child in _children(pid) if b"spawn_main" in _command(child)]
+    servers = [child for child in _children(pid) if b"multiprocessing.forkserver" in _command(child)]
+    return sorted([*spawned, *(worker for server in servers for worker in _children(server))])
+
+
+def _children(pid: int) -> list[int]:
     found: list[str] = []
     for thread in Path(f"/proc/{pid}/task").glob("*"):
         # Each thread has the children that it started itself.
         with contextlib.suppress(FileNotFoundError, ProcessLookupError):
             found += (thread / "children").read_text().split()
-    return sorted(int(child) for child in found if _is_worker(child))
+    return [int(child) for child in found]
 
 
-def _is_worker(pid: str) -> bool:
+def _command(pid: int) -> bytes:
     try:
-        return b"spawn_main" in Path(f"/proc/{pid}/cmdline").read_bytes()
+        return Path(f"/proc/{pid}/cmdline").read_bytes()
     except (FileNotFoundError, ProcessLookupError):
-        return False
+        return b""
 
 
 def kill_one(pids: list[int], chance: random.Random) -> bool:

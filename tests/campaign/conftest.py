@@ -11,6 +11,11 @@ from tests.campaign.compare import plan_of
 from tests.conftest import Shared, SmallTrial
 
 
+@pytest.fixture(autouse=True)
+def _replayed_once(replayed_once: None) -> None:
+    """Campaigns are the subject here."""
+
+
 @pytest.fixture(scope="session")
 def undisturbed(shared: Shared, small_trial: SmallTrial) -> Path:
     """Each run replayed by itself, in this process."""

@@ -221,6 +221,7 @@ def test_our_own_defect_is_told_apart(small_trial: SmallTrial, tmp_path: Path, m
     assert by_run(run_campaign(plan))["run0"].status is RunStatus.OK
 
 
+@pytest.mark.usefixtures("forked_workers")
 def test_killed_worker_is_tried_once_more(small_trial: SmallTrial, undisturbed: Path, tmp_path: Path) -> None:
     killed: list[int] = []
 
@@ -291,6 +292,7 @@ def test_workers_that_never_start_fail_their_runs(
     assert run_campaign(plan).count(RunStatus.FAILED) == 2
 
 
+@pytest.mark.usefixtures("forked_workers")
 def test_run_whose_worker_always_dies_is_reported(small_trial: SmallTrial, tmp_path: Path) -> None:
     endless(tmp_path / "deadly.mcap")
     deaths: set[int] = set()
@@ -310,6 +312,7 @@ def test_run_whose_worker_always_dies_is_reported(small_trial: SmallTrial, tmp_p
     assert store.completed_runs(tmp_path / "out")["deadly"]["redo"] == "yes"
 
 
+@pytest.mark.usefixtures("forked_workers")
 def test_hanging_run_is_given_up(small_trial: SmallTrial, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     endless(tmp_path / "hanging.mcap")
     clock = Hurried(monkeypatch, "loop")

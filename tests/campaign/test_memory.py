@@ -51,6 +51,7 @@ class MemoryKiller:
     def end(self, summary: CampaignSummary) -> None: ...
 
 
+@pytest.mark.usefixtures("forked_workers")
 def test_a_run_without_memory_fails_and_the_campaign_goes_on(tmp_path: Path, small_trial: SmallTrial) -> None:
     gnss = pl.read_parquet(small_trial.paths[0] / "gnss.parquet").head(1)
     steps = pl.duration(milliseconds=1) * pl.int_range(_ROWS, dtype=pl.Int64)

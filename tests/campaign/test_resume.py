@@ -99,6 +99,7 @@ def test_what_the_disk_did_not_give_is_no_failure_of_the_log() -> None:
         assert failure_of(found.value, lasting=True).lasting == lasting
 
 
+@pytest.mark.usefixtures("forked_workers")
 def test_packed_runs_are_known_and_new_ones_replayed(
     settled: tuple[SmallTrial, Path], small_trial: SmallTrial, monkeypatch: pytest.MonkeyPatch
 ) -> None:

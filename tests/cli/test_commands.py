@@ -29,6 +29,8 @@ from schemas.tables import CONTRACT_VERSION
 from tests.conftest import SmallTrial
 from tests.make.receivers.messages import sentence
 
+pytestmark = pytest.mark.usefixtures("replayed_once")
+
 ROOT = Path(__file__).parents[2]
 
 

@@ -68,7 +68,9 @@ def _fill_asked(folder: Path) -> None:
 
 
 @pytest.fixture
-def workplace(workspace: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, in_process: None) -> Path:
+def workplace(
+    workspace: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, in_process: None, replayed_once: None
+) -> Path:
     """A copy of the folder to work in; it is the working directory."""
     folder = tmp_path / "work"
     shutil.copytree(workspace, folder)

@@ -15,19 +15,17 @@ from functools import partial
 
 import numpy as np
 
+from datasets.experiment.bank import SENSORS, BankSpec, linear_bank
 from datasets.experiment.geometry import default_geometry
-from datasets.experiment.linear_bank import BankSpec, linear_bank
-from datasets.experiment.plan import SENSORS
-from datasets.experiment.ranges import RangePlan
-from datasets.experiment.rare import (
+from datasets.experiment.range_system import RangePlan, range_system
+from datasets.experiment.sampling import (
     Probability,
+    System,
     false_alarm_probability,
     first_below,
     missed_detection_probability,
     pooled,
 )
-from datasets.experiment.rare_ranges import range_system
-from datasets.experiment.splitting import System
 from datasets.experiment.workers import generator, in_blocks
 from pipeline.stages.run_row.bounds import clopper_pearson
 from schemas.arrays import Floats

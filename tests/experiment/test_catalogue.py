@@ -8,11 +8,16 @@ import pytest
 
 from datasets.experiment import EXPERIMENTS
 from datasets.experiment import catalogue as module
-from datasets.experiment.catalogue import run_catalogue
+from datasets.experiment.catalogue import (
+    JOURNEYS,
+    JourneyPlan,
+    PreparedJourney,
+    prepare_journey,
+    run_catalogue,
+    with_fault,
+)
 from datasets.experiment.catalogue_faults import CatalogueFault, catalogue
-from datasets.experiment.catalogue_tables import faults_table, monitors_table
-from datasets.experiment.catalogue_text import catalogue_page
-from datasets.experiment.catalogue_trial import JOURNEYS, JourneyPlan, Stage, stage, with_fault
+from datasets.experiment.catalogue_report import catalogue_page, faults_table, monitors_table
 from pipeline.stages.track.geodesy import distances_m
 from schemas.config import Configuration, MonitorConfig
 from schemas.run import RunLog, Site
@@ -22,17 +27,17 @@ FAULTS = {fault.name: fault for fault in catalogue()}
 
 
 @pytest.fixture(scope="module")
-def short() -> Stage:
-    return stage(JOURNEYS["short"], 7, 1.0)
+def short() -> PreparedJourney:
+    return prepare_journey(JOURNEYS["short"], 7, 1.0)
 
 
 @pytest.fixture(scope="module")
-def healthy(short: Stage) -> tuple[RunLog, Site]:
+def healthy(short: PreparedJourney) -> tuple[RunLog, Site]:
     return with_fault(short, FAULTS["healthy short"])
 
 
-def seconds(frame: pl.DataFrame, ready: Stage) -> pl.DataFrame:
-    return frame.with_columns(s=((pl.col("t").dt.timestamp("ns") - ready.onset_ns) / 1e9).round(6))
+def seconds(frame: pl.DataFrame, prepared: PreparedJourney) -> pl.DataFrame:
+    return frame.with_columns(s=((pl.col("t").dt.timestamp("ns") - prepared.onset_ns) / 1e9).round(6))
 
 
 def test_names_are_unique_and_every_kind_asked_for_is_there() -> None:
@@ -47,7 +52,7 @@ def test_names_are_unique_and_every_kind_asked_for_is_there() -> None:
     assert wanted <= kinds
 
 
-def test_a_frozen_receiver_repeats_its_last_position(short: Stage, healthy: tuple[RunLog, Site]) -> None:
+def test_a_frozen_receiver_repeats_its_last_position(short: PreparedJourney, healthy: tuple[RunLog, Site]) -> None:
     run, _ = with_fault(short, FAULTS["frozen position 10 s"])
     frozen, free = (seconds(one.gnss.filter(pl.col("solution") == "primary"), short) for one in (run, healthy[0]))
     last = free.filter(pl.col("s") == -1.0)["latitude_deg"][0]
@@ -57,7 +62,7 @@ def test_a_frozen_receiver_repeats_its_last_position(short: Stage, healthy: tupl
     assert frozen.filter(rest).equals(free.filter(rest))
 
 
-def test_clocks_jump_at_the_onset_and_not_before(short: Stage, healthy: tuple[RunLog, Site]) -> None:
+def test_clocks_jump_at_the_onset_and_not_before(short: PreparedJourney, healthy: tuple[RunLog, Site]) -> None:
     ahead, _ = with_fault(short, FAULTS["clock ahead 3 s"])
     moved = (ahead.gnss["t"] - healthy[0].gnss["t"]).dt.total_milliseconds()
     later = seconds(healthy[0].gnss, short)["s"] >= 0.0
@@ -70,7 +75,7 @@ def test_clocks_jump_at_the_onset_and_not_before(short: Stage, healthy: tuple[Ru
     assert late.odometer["distance_m"].equals(healthy[0].odometer["distance_m"])
 
 
-def test_the_map_is_moved_from_the_next_element_on(short: Stage, healthy: tuple[RunLog, Site]) -> None:
+def test_the_map_is_moved_from_the_next_element_on(short: PreparedJourney, healthy: tuple[RunLog, Site]) -> None:
     """The train is 15 m before the border of the fifth and sixth element at the onset."""
     _, site = with_fault(short, FAULTS["map off to the left 5 m"])
     before, after = healthy[1].track, site.track
@@ -85,15 +90,15 @@ def test_the_map_is_moved_from_the_next_element_on(short: Stage, healthy: tuple[
     assert max(off) == pytest.approx(5.0, rel=0.01)
 
 
-def test_lists_and_reads_are_changed_behind_the_onset_alone(short: Stage, healthy: tuple[RunLog, Site]) -> None:
+def test_lists_and_reads_change_behind_the_onset_alone(short: PreparedJourney, healthy: tuple[RunLog, Site]) -> None:
     _, site = with_fault(short, FAULTS["balise list wrong 30 m"])
     assert site.balises is not None
     assert healthy[1].balises is not None
     moved = site.balises["measure_m"] - healthy[1].balises["measure_m"]
     assert set(moved.to_list()) == {0.0, 30.0}
-    ready = stage(JOURNEYS["physical"], 7, 1.0)
+    prepared = prepare_journey(JOURNEYS["physical"], 7, 1.0)
     full, missing, late = (
-        with_fault(ready, FAULTS[name])[0].balise_reads
+        with_fault(prepared, FAULTS[name])[0].balise_reads
         for name in ("healthy physical", "physical balise missing 2", "physical balise late 3 s")
     )
     assert full is not None
@@ -101,7 +106,7 @@ def test_lists_and_reads_are_changed_behind_the_onset_alone(short: Stage, health
     assert late is not None
     gone = full.filter(~pl.col("balise_id").is_in(missing["balise_id"].implode()))
     assert gone.height == 2
-    assert (seconds(gone, ready)["s"] >= 0.0).all()
+    assert (seconds(gone, prepared)["s"] >= 0.0).all()
     assert set((late["t"] - full["t"]).dt.total_seconds()) == {0, 3}
 
 
@@ -125,7 +130,8 @@ def runs_by_hand() -> pl.DataFrame:
             }
             for number, (detected, way, first, failure, unsafe, linking, times) in enumerate(rows)
         ],
-        schema=module._SCHEMA,
+        infer_schema_length=None,
+        schema_overrides=module._NULLABLE,
     )  # fmt: skip
 
 

@@ -1,26 +1,42 @@
 """Importance sampling against counting, against theory, and against the recursion of the bank."""
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 from scipy.special import ndtr
 
+from datasets.experiment import EXPERIMENTS
+from datasets.experiment.bank import PUBLISHED_WEIGHTS, BankSpec, LinearBank, linear_bank
 from datasets.experiment.geometry import TAUS_S, Constellation, default_geometry
-from datasets.experiment.linear_bank import BankSpec, LinearBank, linear_bank
-from datasets.experiment.plan import BANKS
-from datasets.experiment.rare import (
+from datasets.experiment.rare import banks, epochs_until, failure_epoch
+from datasets.experiment.sampling import (
     Probability,
     false_alarm_probability,
     figures,
     first_below,
     missed_detection_probability,
+    most_probable_miss,
     population_of,
 )
-from datasets.experiment.sigmas import bank_sigmas, limit_sigmas
-from datasets.experiment.splitting import most_probable_miss
 from datasets.experiment.workers import generator, in_blocks
+from schemas.config import Configuration, MonitorConfig
+from schemas.errors import UsageError
 from tests.experiment.counting import agree, counted_alarms, counted_misses
+from tests.experiment.sigmas import bank_sigmas, limit_sigmas
 
 GPS = default_geometry("gps")
+
+
+def monitored_noise(system: LinearBank, epochs: int, runs: int) -> np.ndarray:
+    """Noise of all monitors, (epochs, monitors, runs)."""
+    rng = generator(1)
+    state = system.start(runs, rng)
+    values = []
+    for _ in range(epochs):
+        state = system.following(state, rng)
+        values.append(system.values(state).copy())
+    return np.stack(values)
 
 
 def bank(**changes: object) -> LinearBank:
@@ -34,13 +50,13 @@ def test_sigmas_are_those_of_the_closed_form(rate_hz: float) -> None:
     for index, (white, position) in enumerate(((0.05, 0.0), (0.0, 1.0), (0.0, 1.0))):
         axis = GPS.axes(30.0)[index]
         variances = np.einsum("a,jab,b->j", axis, GPS.source_covariances_m2, axis)
-        wanted = limit_sigmas(np.array(BANKS["increments"]), variances, TAUS_S, white, position, rate_hz)
+        wanted = limit_sigmas(np.array(PUBLISHED_WEIGHTS["increments"]), variances, TAUS_S, white, position, rate_hz)
         assert system.sigma[4 * index : 4 * index + 4] == pytest.approx(wanted, rel=1e-7)
 
 
 def test_covariances_over_time_are_those_of_simulated_paths() -> None:
     system = bank(reading="position")
-    paths = np.stack([noise.copy() for noise in system.paths(40, 40_000, generator(1))])
+    paths = monitored_noise(system, 40, 40_000)
     wanted = system.covariance_with(2, 25, system.covariances(40))
     measured = (paths * paths[24, 2]).mean(axis=2)
     scale = system.sigma * system.sigma[2]
@@ -78,7 +94,7 @@ def test_a_single_gaussian_miss_has_its_exact_probability() -> None:
     """Raw monitor alone, one epoch: P(|m + r| < T) by the normal distribution, at 1e-9 and beyond."""
     system = bank(alphas=(1.0,))
     for rate in (2.0, 3.5):
-        shift = rate * system.response(1)[0, 0] / system.sigma[0]
+        shift = system.ramp(1, rate)[0, 0] / system.sigma[0]
         factor = system.threshold[0] / system.sigma[0]
         exact = ndtr(factor - shift) - ndtr(-factor - shift)
         result = missed_detection_probability(system, 1, rate, runs=4000, seed=6)
@@ -90,7 +106,7 @@ def test_a_single_gaussian_miss_has_its_exact_probability() -> None:
 def test_the_most_probable_miss_stays_inside_the_thresholds() -> None:
     system = bank(sensors="odometer_and_track", reading="position")
     shift = most_probable_miss(system, 150, 0.2)
-    path = shift.mean + 0.2 * system.response(150)
+    path = shift.mean + system.ramp(150, 0.2)
     assert (np.abs(path) <= system.threshold * 1.001).all()
     assert shift.half_square > 0
 
@@ -145,7 +161,7 @@ def test_a_young_bank_has_its_own_sigmas_and_misses(age_s: float) -> None:
     young, old = bank(age_s=age_s), bank()
     axis = GPS.axes(0.0)[0]
     variances = np.einsum("a,jab,b->j", axis, GPS.source_covariances_m2, axis)
-    exact = bank_sigmas(np.array(BANKS["increments"]), int(age_s) + 60, variances, TAUS_S, 0.05, 0.0)
+    exact = bank_sigmas(np.array(PUBLISHED_WEIGHTS["increments"]), int(age_s) + 60, variances, TAUS_S, 0.05, 0.0)
     assert young.sigmas(60) == pytest.approx(exact[int(age_s) :], rel=1e-7)
     clever = missed_detection_probability(young, 60, 0.3, runs=4000, seed=9)
     plain = counted_misses(young, 60, 0.3, runs=60_000, seed=10)
@@ -206,3 +222,33 @@ def test_the_error_of_a_probability_below_the_smallest_square() -> None:
     result = missed_detection_probability(system, 120, 1.0, runs=2_000, seed=12)
     assert 0.0 < result.value < 1e-155
     assert 0.0 < result.relative_error < 0.6
+
+
+def test_time_until_a_miss_is_rare_enough() -> None:
+    system = bank()
+    earlier, later = epochs_until(system, 1.0, (1e-3, 1e-9), seed=1, jobs=1, period_s=1.0)
+    assert earlier is not None
+    assert later is not None
+    assert earlier < later < failure_epoch(system, 1.0)
+    assert failure_epoch(system, 1.0) == pytest.approx(20.0 / abs(float(system.along_error[0])), abs=1.0)
+
+
+def test_a_configured_bank_is_judged(tmp_path: Path) -> None:
+    """The replay's configuration as a bank; the published experiment refuses one instead of ignoring it."""
+    config = Configuration(
+        monitors=MonitorConfig(ewma_alphas=(0.2, 0.05, 0.005), odometer_sigma_mps=0.1, false_alarm_probability=1e-6)
+    )
+    spec = BankSpec.of(config.monitors, "odometer_and_track", 10.0)
+    assert spec.weights == (1.0, 0.2, 0.05, 0.005)
+    assert (spec.odometer_m, spec.false_alarm_probability, spec.rate_hz) == (0.1, 1e-6, 10.0)
+    assert all(chosen.spec.weights == spec.weights for _, chosen in banks(config))
+    with pytest.raises(UsageError, match="takes no configuration"):
+        EXPERIMENTS["diagnostics"](tmp_path, 1, 1, 1, config)
+
+
+@pytest.mark.parametrize(("rate_hz", "hours"), [(1.0, 413.0), (10.0, 75.0)])
+def test_a_healthy_bank_alarms_once_in_so_many_hours(rate_hz: float, hours: float) -> None:
+    """Twelve monitors, a track whose error is constant: what docs/experiments.md gives from more runs."""
+    system = linear_bank(GPS, 30.0, BankSpec(sensors="odometer_and_track", rate_hz=rate_hz, map_m=1e-6))
+    hourly = false_alarm_probability(system, int(3_600 * rate_hz), runs=100 if rate_hz > 1.0 else 150)
+    assert hours / 1.3 < -1.0 / np.log1p(-hourly.value) < hours * 1.3

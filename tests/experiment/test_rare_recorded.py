@@ -9,11 +9,12 @@ import numpy as np
 import polars as pl
 import pytest
 
-from datasets.experiment import EXPERIMENTS, rare_recorded
-from datasets.experiment.linear_bank import BankSpec, bank_along
-from datasets.experiment.rare import missed_detection_probability
+from datasets.experiment import EXPERIMENTS, rare
+from datasets.experiment.bank import BankSpec, bank_of_axis
+from datasets.experiment.sampling import missed_detection_probability
 from schemas.config import Configuration, MonitorConfig
 from schemas.errors import UsageError
+from schemas.tables import SCALES
 
 SPEC = BankSpec(alphas=(1.0, 0.1, 0.01), false_alarm_probability=1e-4)
 R_M2, TAU_S, WHITE_M = np.array([0.2, 0.1, 0.0, 0.7]), np.array([360.0, 1800.0, 3600.0, 100.0]), 0.3
@@ -21,7 +22,7 @@ R_M2, TAU_S, WHITE_M = np.array([0.2, 0.1, 0.0, 0.7]), np.array([360.0, 1800.0, 
 
 def test_monitors_and_misses_are_those_of_simulated_positions() -> None:
     """2,000 journeys of 1,200 s without a fault, then a ramp of 0.03 m/s for 120 s; thresholds are the bank's own."""
-    made = bank_along(SPEC, R_M2, TAU_S, WHITE_M)
+    made = bank_of_axis(SPEC, R_M2, TAU_S, WHITE_M)
     rng = np.random.default_rng(4)
     journeys, before, after, rate_mps = 2_000, 1_200, 120, 0.03
     phi = np.exp(-1.0 / TAU_S)[:, None]
@@ -62,22 +63,22 @@ def tables_of_a_result(faults: bool = False, white_m: float | None = 0.05) -> di
         "run_id": ["a"] * 3 + ["b"] * 3, "solution": ["primary"] * 6,
         "t": [start + timedelta(seconds=k) for k in range(6)],
         "sigma_along_m": [1.0, 9.0, 2.0, 1.0, 9.0, 2.0], "alarm": [False, True, False] * 2,
-        **{f"along_{scale}_value": [0.3, 5.0, -0.3] * 2 for scale in rare_recorded.SCALES},
-        **{f"along_{scale}_threshold": [1.0] * 6 for scale in rare_recorded.SCALES},
-        **{f"along_{scale}_state": ["pass", "fail", "pass"] * 2 for scale in rare_recorded.SCALES},
+        **{f"along_{scale}_value": [0.3, 5.0, -0.3] * 2 for scale in SCALES},
+        **{f"along_{scale}_threshold": [1.0] * 6 for scale in SCALES},
+        **{f"along_{scale}_state": ["pass", "fail", "pass"] * 2 for scale in SCALES},
     })  # fmt: skip
     return {"runs": runs, "epochs": epochs}
 
 
 def given(monkeypatch: pytest.MonkeyPatch, tables: dict[str, pl.DataFrame]) -> None:
-    monkeypatch.setattr(rare_recorded, "read_table", lambda _, name: tables[name].lazy())
-    monkeypatch.setattr(rare_recorded, "read_config", lambda _: None)
+    monkeypatch.setattr(rare, "read_table", lambda _, name: tables[name].lazy())
+    monkeypatch.setattr(rare, "read_config", lambda _: None)
 
 
 def test_noise_is_that_of_epochs_without_an_alarm(monkeypatch: pytest.MonkeyPatch) -> None:
     """sigma 1 and 2 m; values of 0.3 thresholds are 0.3 x 5.3267 sigmas."""
     given(monkeypatch, tables_of_a_result())
-    (noise,) = rare_recorded.recorded_noises(Path("out"))
+    (noise,) = rare.recorded_noises(Path("out"))
     assert (noise.solution, noise.runs, noise.hours, noise.rate_hz) == ("primary", 2, 2.0, 1.0)
     assert (noise.sigma_m, noise.white_m) == (1.5, 0.05)
     assert noise.ratios == pytest.approx([0.3 * 5.3267] * 4, rel=1e-4)
@@ -87,17 +88,17 @@ def test_noise_is_that_of_epochs_without_an_alarm(monkeypatch: pytest.MonkeyPatc
 def test_a_result_without_fault_free_noise_is_refused(monkeypatch: pytest.MonkeyPatch, tables: dict) -> None:  # type: ignore[type-arg]
     given(monkeypatch, tables)
     with pytest.raises(UsageError, match="has no run whose noise along the track is known"):
-        rare_recorded.recorded_noises(Path("out"))
+        rare.recorded_noises(Path("out"))
 
 
 def test_only_the_rare_side_takes_recorded_noise(tmp_path: Path) -> None:
     with pytest.raises(UsageError, match="takes no recorded noise"):
-        EXPERIMENTS["bank"](tmp_path, recorded=tmp_path)
+        EXPERIMENTS["catalogue"](tmp_path, recorded=tmp_path)
 
 
 def test_the_model_is_that_of_the_thresholds() -> None:
     """sigma 2 m, no white noise: variances are the shares of 4 m2, and the shares of the default add up to one."""
-    noise = rare_recorded.RecordedNoise("primary", 1, 1.0, 1.0, 2.0, 0.0, (None,) * 4)
+    noise = rare.RecordedNoise("primary", 1, 1.0, 1.0, 2.0, 0.0, (None,) * 4)
 
     bank = noise.bank(Configuration(), 1.0)
     config = MonitorConfig()

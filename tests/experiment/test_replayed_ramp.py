@@ -5,8 +5,8 @@ from datetime import timedelta
 import polars as pl
 import pytest
 
+from datasets.experiment.catalogue import JOURNEYS, JourneyPlan, prepare_journey, with_fault
 from datasets.experiment.catalogue_faults import CatalogueFault
-from datasets.experiment.catalogue_trial import JOURNEYS, JourneyPlan, stage, with_fault
 from pipeline.one_run import replay
 from schemas.config import Configuration
 from schemas.run import RunLog
@@ -33,11 +33,11 @@ DUAL = ("dual", "E18", JourneyPlan(7_000.0, 500.0, start="2024-03-20T07:21:40Z",
 def test_a_range_ramp_of_1_cm_per_second_is_found_before_the_failure(
     solution: str, satellite: str, plan: JourneyPlan, period_s: int
 ) -> None:
-    ready = stage(plan, 11, 1.0)
-    run, site = with_fault(ready, ramp_of(satellite))
+    prepared = prepare_journey(plan, 11, 1.0)
+    run, site = with_fault(prepared, ramp_of(satellite))
     other = {"primary": "dual", "dual": "primary"}[solution]
     run = run.with_streams(gnss=run.gnss.filter(pl.col("solution") != other))
-    tables = replay(recorded_every(run, period_s), site, ready.vehicle, Configuration())
+    tables = replay(recorded_every(run, period_s), site, prepared.vehicle, Configuration())
     hazard = tables.hazards.row(0, named=True)
     assert hazard["detected"]
     assert hazard["t_failure"] is not None

@@ -26,6 +26,8 @@ from schemas.project import Project
 from schemas.words import remedy_words
 from tests.conftest import SmallTrial
 
+pytestmark = pytest.mark.usefixtures("replayed_once")
+
 
 def nmea(lines: int = 40, acceleration_mps2: float = 0.0) -> str:
     """A receiver at 1 Hz that goes north, faster and faster."""

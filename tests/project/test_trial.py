@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 import cli
-from pipeline.project.looking import SeenLog, StreamSpan, look_at_dates
+from pipeline.project.looking import InspectedLog, StreamSpan, look_at_dates
 from pipeline.project.recorded_runs import group_into_runs
 from schemas.config import IngestConfig, StreamCorrection
 from schemas.project import Project, load_project
@@ -20,9 +20,9 @@ MORNING = datetime(2025, 3, 3, 6)
 ODOMETER = "time;v_kmh\n" + "".join(f"2025-03-03T10:12:{second:02d}Z;0.0\n" for second in range(40))
 
 
-def log(name: str, begin_min: float, end_min: float, stream: str = "gnss") -> SeenLog:
+def log(name: str, begin_min: float, end_min: float, stream: str = "gnss") -> InspectedLog:
     times = (MORNING + timedelta(minutes=minute) for minute in (begin_min, end_min))
-    return SeenLog(Path(name), {stream: StreamSpan(10, *times)})  # type: ignore[dict-item]
+    return InspectedLog(Path(name), {stream: StreamSpan(10, *times)})  # type: ignore[dict-item]
 
 
 @pytest.mark.parametrize(
@@ -42,7 +42,7 @@ def log(name: str, begin_min: float, end_min: float, stream: str = "gnss") -> Se
         ),
     ],
 )
-def test_logs_of_one_ride(logs: list[SeenLog], recorded_runs: list[list[str]]) -> None:
+def test_logs_of_one_ride(logs: list[InspectedLog], recorded_runs: list[list[str]]) -> None:
     found, alone = group_into_runs(logs, [])
     assert alone == []
     told = [
@@ -241,11 +241,11 @@ def test_a_logger_of_local_time_is_corrected_in_all_its_streams_and_the_receiver
 def test_dates_are_in_the_order_that_fits_other_logs(tmp_path: Path) -> None:
     (tmp_path / "plc.csv").write_text("Zeit;Weg\n12.06.2025 11:30:00;1,0\n12.06.2025 11:30:01;2,0\n")
 
-    def on(month: int, day: int) -> SeenLog:
+    def on(month: int, day: int) -> InspectedLog:
         times = (datetime(2025, month, day, 9, 30, tzinfo=UTC), datetime(2025, month, day, 9, 40, tzinfo=UTC))
-        return SeenLog(Path("a.ubx"), {"gnss": StreamSpan(10, *times)})
+        return InspectedLog(Path("a.ubx"), {"gnss": StreamSpan(10, *times)})
 
-    def start(*others: SeenLog) -> datetime | None:
+    def start(*others: InspectedLog) -> datetime | None:
         seen = look_at_dates(tmp_path / "plc.csv", IngestConfig(), others)
         return seen and seen.start
 

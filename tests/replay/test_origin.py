@@ -14,7 +14,7 @@ from schemas.config import Vehicle
 from schemas.enums import NotEvaluated, Origin
 from schemas.run import RunLog, RunTables
 from schemas.tables import BANK_MONITORS
-from schemas.words import beside_words
+from schemas.words import verdict_figures_words
 from tests.replay.journeys import VEHICLE, journey, replay
 
 ALONG = [name for name in (*BANK_MONITORS, "along_doppler") if name.startswith("along_")]
@@ -60,7 +60,7 @@ def test_a_declared_sensor_free_of_the_gnss_may_prove_a_run_safe(origin: Origin)
     assert found["odometer_follows"] > 0.5
     assert not {"odometer_origin_unknown", "odometer_follows_gnss"} & set(found["reasons"])
     assert found["verdict"] == "safe"
-    assert "provided that the odometer is" in beside_words(found)
+    assert "provided that the odometer is" in verdict_figures_words(found)
 
 
 @pytest.mark.parametrize("origin", [None, Origin.UNKNOWN])
@@ -71,7 +71,7 @@ def test_of_unknown_origin_it_monitors_and_proves_no_run_safe(origin: Origin | N
     assert "odometer_origin_unknown" in found["reasons"]
     assert found["remedies"][0] == "odometer_origin"
     assert (tables.epochs["along_raw_state"] == "pass").any()
-    assert "provided" not in beside_words(found)
+    assert "provided" not in verdict_figures_words(found)
 
 
 def test_the_vehicle_file_declares_what_the_run_does_not_say() -> None:

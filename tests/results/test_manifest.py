@@ -218,6 +218,7 @@ def test_a_manifest_of_any_content_stops_nothing(out: Path, tmp_path: Path, cont
     assert manifest_of(copy)["runs"] == expected
 
 
+@pytest.mark.usefixtures("forked_workers")
 def test_a_run_made_without_vehicle_file_is_replayed_without(out: Path, small_trial: SmallTrial, train: Path) -> None:
     logs = [str(path) for path in small_trial.paths[:2]]
     again = recompute(out, logs, small_trial.site, None, load_settings(train, Vehicle))

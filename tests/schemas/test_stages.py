@@ -16,6 +16,7 @@ from pipeline.stages.matching import match
 from pipeline.stages.odometry import odometry_of
 from schemas.config import Configuration, Vehicle
 from schemas.stages import ONE_TRACK_LEFT, AlignedEpochs, MatchedEpochs
+from tests.arrays_of_table import arrays_of_table
 from tests.replay.journeys import VEHICLE, journey
 
 CONFIG = Configuration()
@@ -67,7 +68,7 @@ def test_what_is_on_the_track_has_a_place_and_what_has_a_place_has_a_fix(with_od
 
 def test_a_table_comes_back_as_the_arrays_that_it_was_made_of():
     for epochs in stages(VEHICLE, with_odometer=True)[1:]:
-        again = type(epochs).of_table(epochs.table)
+        again = arrays_of_table(type(epochs), epochs.table)
         assert again.table.equals(epochs.table)
         assert epochs.table["leg"].null_count() == (~epochs.fix_valid).sum()
         assert not any(epochs.table.select(pl.col(pl.Float64).is_nan().any()).row(0))

@@ -1,13 +1,20 @@
-"""One run as it was recorded, by one bank: what it raised without a fault, and where it may be used."""
+"""One run as it was recorded, by one bank, and the instants at which faults begin: the same for every bank.
+
+They are drawn where nothing was wrong.
+"""
 
 from __future__ import annotations
 
+import zlib
+from bisect import bisect_left, insort
+from collections.abc import Mapping, Sequence
 from functools import cached_property
 
 import numpy as np
 import polars as pl
 
-from datasets.experiment.recorded.plan import Bank
+from datasets.experiment.recorded.plan import Bank, Cell, RecordedPlan
+from datasets.experiment.workers import generator
 from datasets.inject import Recording
 from pipeline.one_run import monitor_alone
 from pipeline.stages.epochs.clock import Clock, holds, unambiguous
@@ -24,8 +31,20 @@ from schemas.frozen import frozen
 from schemas.run import RunLog, Site
 
 _REASONS = tuple(LeftOut)
-# Satellites must stand beside so many of the positions: a range fault moves only these.
-_RANGES_BESIDE = 0.99
+# Share of the positions that must have satellites: a range fault moves only these.
+_SHARE_WITH_RANGES = 0.99
+
+
+@frozen
+class FaultFree:
+    """One bank on recorded runs without a fault: alarms in so many hours, time with a TVB and in all."""
+
+    bank: str
+    runs: int
+    hours: float
+    alarms: int
+    tvb_s: float
+    recorded_s: float
 
 
 @frozen
@@ -79,9 +98,12 @@ class Baseline:
     def clock(self) -> Clock:
         return Clock.of(self.epochs, self.config)
 
-    def hours(self) -> float:
-        """Time held by epochs at which an alarm could have begun [h]: none can while one stands."""
-        return float(self.clock.held_s[self.watched & ~self.alarming].sum()) / 3600.0
+    def fault_free(self) -> FaultFree:
+        """What this bank did on the run as it was recorded; no alarm can begin while one stands."""
+        held_s = self.clock.held_s
+        hours = float(held_s[self.watched & ~self.alarming].sum()) / 3600.0
+        tvb_s = float(held_s[flags(self.epochs, "tvb")].sum())
+        return FaultFree(self.bank.name, 1, hours, self.alarms.height, tvb_s, float(held_s.sum()))
 
     @cached_property
     def watched(self) -> Bools:
@@ -99,7 +121,7 @@ class Baseline:
         for why, where in (
             (LeftOut.NOT_RIGHT, doubtful),
             (LeftOut.NO_TVB, ~flags(self.epochs, "tvb") | after_gap),
-            (LeftOut.AMBIGUOUS, ~holds(self.epochs, unambiguous()) & floats_known(self.epochs, "path_m")),
+            (LeftOut.AMBIGUOUS, ~holds(self.epochs, unambiguous()) & self.epochs["path_m"].is_not_null().to_numpy()),
             (LeftOut.ALARM, self.alarming),
         ):
             reason[where] = _REASONS.index(why)
@@ -110,21 +132,20 @@ class Baseline:
         ranges = self.monitored.prepared.ranges(self.solution)
         if ranges is None:
             return []
-        stamp = pl.lit(t_ns).cast(pl.Datetime("ns", "UTC"))
-        return ranges.filter((pl.col("t") == stamp) & pl.col("used"))["sv"].unique().sort().to_list()
+        return ranges.filter((pl.col("t") == instant(t_ns)) & pl.col("used"))["sv"].unique().sort().to_list()
 
     @cached_property
     def has_ranges(self) -> bool:
-        """Satellites stand beside nearly all positions, so that a range fault can move them."""
+        """Nearly all positions have satellites, so that a range fault can move them."""
         ranges = self.monitored.prepared.ranges(self.solution)
         if ranges is None or ranges.is_empty():
             return False
-        return float(np.isin(self.t_ns, times_ns(ranges)).mean()) >= _RANGES_BESIDE
+        return float(np.isin(self.t_ns, times_ns(ranges)).mean()) >= _SHARE_WITH_RANGES
 
 
-def floats_known(frame: pl.DataFrame, column: str) -> Bools:
-    """Where a nullable number is known."""
-    return frame[column].is_not_null().to_numpy()
+def instant(t_ns: int) -> pl.Expr:
+    """A time stamp [ns since 1970, UTC] to compare with columns `t`."""
+    return pl.lit(t_ns).cast(pl.Datetime("ns", "UTC"))
 
 
 def _with_quiet(reason: Ints, t_ns: Ints, quiet_s: float) -> Ints:
@@ -151,7 +172,7 @@ def baseline_of(run: RunLog, site: Site, vehicle: Vehicle, bank: Bank, solution:
     require_independent_odometer(monitored.prepared)
     evidence = monitored.prepared.evidence()
     judged = _judged(monitored, evidence)
-    return Baseline(run, site, bank, monitored, evidence, judged.epochs, judged.alarms, Recording(run, site))
+    return Baseline(run, site, bank, monitored, evidence, judged.epochs.table, judged.alarms, Recording(run, site))
 
 
 def _judged(monitored: MonitoredSolution, evidence: TrainEvidence) -> Judged:
@@ -160,3 +181,109 @@ def _judged(monitored: MonitoredSolution, evidence: TrainEvidence) -> Judged:
     return judge(
         JudgeInput(monitored.solution, evidence, monitored.odometry, prepared.vehicle, prepared.config, reference)
     )
+
+
+@frozen
+class Room:
+    """Where faults may begin in one run, by all banks; arrays per epoch.
+
+    `left_out`: number of the reason in `LeftOut`, -1 where a fault may begin; `free_ns`: before the next alarm or
+    negation, or the last epoch.
+    """
+
+    run_id: str
+    first_ns: int
+    t_ns: Ints
+    held_s: np.ndarray
+    left_out: Ints
+    free_ns: Ints
+    has_ranges: bool
+
+    def takes(self, cell: Cell) -> bool:
+        """The run records what the fault needs."""
+        return self.has_ranges or not cell.hits_satellite
+
+    def eligible(self, cell: Cell) -> Bools:
+        """Epochs at which a fault of this cell may begin and be watched to its end."""
+        watched: Bools = self.t_ns + round(cell.watch_s * NS_PER_S) <= self.free_ns
+        return watched & (self.left_out < 0) & self.takes(cell)
+
+    def longest_s(self) -> float:
+        """The longest watch that some epoch allows [s]."""
+        allowed = (self.free_ns - self.t_ns)[self.left_out < 0]
+        return float(allowed.max(initial=0)) / NS_PER_S
+
+    def seconds_left_out(self) -> dict[str, float]:
+        """Time in which no fault begins, by reason, and the rest [s]."""
+        by_reason = {
+            f"{why.value}_s": float(self.held_s[self.left_out == number].sum()) for number, why in enumerate(_REASONS)
+        }
+        return {**by_reason, "usable_s": float(self.held_s[self.left_out < 0].sum())}
+
+
+def room_of(baselines: Sequence[Baseline], quiet_s: float) -> Room:
+    """What all banks leave of a run: an epoch that one of them leaves out is left out for all."""
+    first = baselines[0]
+    left_out = np.max([base.left_out(quiet_s) for base in baselines], axis=0)
+    alarming = np.logical_or.reduce([base.alarming for base in baselines])
+    # An alarm at the very end of a watch would be taken for one of the fault.
+    ends_ns = np.where(alarming, first.t_ns - 1, first.t_ns[-1])
+    return Room(
+        run_id=first.run.run_id,
+        first_ns=first.recording.first_ns,
+        t_ns=first.t_ns,
+        held_s=first.clock.held_s,
+        left_out=left_out,
+        free_ns=np.minimum.accumulate(ends_ns[::-1])[::-1],
+        has_ranges=first.has_ranges,
+    )
+
+
+@frozen
+class Onset:
+    """One fault to put in: of this cell, into this run, at this epoch; `lot`: what a satellite is drawn by, [0, 1)."""
+
+    number: int
+    cell: Cell
+    run_id: str
+    t_ns: int
+    lot: float
+
+
+def onsets_of(
+    rooms: Sequence[Room], cells: Sequence[Cell], plan: RecordedPlan
+) -> dict[str, list[tuple[str, int, float]]]:
+    """Per cell the runs, epochs and lots drawn: at most `cell.count`, fewer where there is no room for more."""
+    return {cell.name: _drawn(rooms, cell, plan) for cell in cells}
+
+
+def numbered(cells: Sequence[Cell], drawn: Mapping[str, list[tuple[str, int, float]]]) -> list[Onset]:
+    """All onsets, cell by cell, in order of run and time."""
+    rows = [(cell, *place) for cell in cells for place in sorted(drawn[cell.name])]
+    return [Onset(number, *row) for number, row in enumerate(rows)]
+
+
+def _drawn(rooms: Sequence[Room], cell: Cell, plan: RecordedPlan) -> list[tuple[str, int, float]]:
+    """Epochs of all runs in random order, each taken unless it is too near to one of its run that was taken before."""
+    rng = generator(plan.seed, zlib.crc32(cell.name.encode()))
+    places = [np.flatnonzero(room.eligible(cell)) for room in rooms]
+    owner = np.repeat(np.arange(len(rooms)), [rows.size for rows in places])
+    rows = np.concatenate(places) if places else np.zeros(0, dtype=np.int64)
+    apart_ns = round(plan.apart_s * NS_PER_S)
+    taken_ns: list[list[int]] = [[] for _ in rooms]
+    drawn: list[tuple[str, int, float]] = []
+    for place in rng.permutation(rows.size).tolist():
+        room = rooms[int(owner[place])]
+        t_ns = int(room.t_ns[rows[place]])
+        if len(drawn) == cell.count:
+            break
+        if _is_apart(taken_ns[int(owner[place])], t_ns, apart_ns):
+            insort(taken_ns[int(owner[place])], t_ns)
+            drawn.append((room.run_id, t_ns, float(rng.random())))
+    return drawn
+
+
+def _is_apart(taken_ns: list[int], t_ns: int, apart_ns: int) -> bool:
+    at = bisect_left(taken_ns, t_ns)
+    neighbours = taken_ns[max(at - 1, 0) : at + 1]
+    return all(abs(t_ns - other) >= apart_ns for other in neighbours)

@@ -14,14 +14,20 @@ from pathlib import Path
 import polars as pl
 import pyarrow.parquet as pq
 
-from datasets.experiment.recorded.baseline import Baseline, baseline_of
-from datasets.experiment.recorded.draw import Onset, Room, numbered, onsets_of, room_of
-from datasets.experiment.recorded.injection import injected
-from datasets.experiment.recorded.outcome import outcome_row
-from datasets.experiment.recorded.page import recorded_page, remarks_on
-from datasets.experiment.recorded.pictures import pictures
+from datasets.experiment.recorded.baseline import (
+    Baseline,
+    FaultFree,
+    Onset,
+    Room,
+    baseline_of,
+    numbered,
+    onsets_of,
+    room_of,
+)
+from datasets.experiment.recorded.outcome import injected, outcome_row
+from datasets.experiment.recorded.page import pictures, recorded_page, remarks_on
 from datasets.experiment.recorded.plan import Bank, Cell, RecordedPlan, banks_of, load_plan
-from datasets.experiment.recorded.tables import Quiet, banks_table, cells_table, places_table, pmd_table
+from datasets.experiment.recorded.tables import banks_table, cells_table, places_table, pmd_table
 from datasets.experiment.tables import Row
 from pipeline import storage
 from pipeline.campaign import find_runs
@@ -30,8 +36,8 @@ from pipeline.read.site.read import read_site
 from pipeline.results.software import software_digest
 from pipeline.results.workers import mapped
 from pipeline.show.terminal import duration_text
+from pipeline.storage.described import noted_bytes
 from pipeline.storage.parquet import parquet_bytes
-from schemas.arrays import flags
 from schemas.config import Configuration, Vehicle, digest_of, load_settings, to_toml
 from schemas.conform import conform, dtypes
 from schemas.enums import RunStatus
@@ -77,7 +83,7 @@ class Inputs:
 
 
 @frozen
-class Made:
+class ExperimentResult:
     """The tables by name, the runs that could not be used, with the reason, and what was written, the page first."""
 
     tables: dict[str, pl.DataFrame]
@@ -98,7 +104,7 @@ class _Surveyed:
     row: Row
     replays_s: float = 0.0
     room: Room | None = None
-    quiet: tuple[Quiet, ...] = ()
+    fault_free: tuple[FaultFree, ...] = ()
     run_digest: str = ""
     error: InputError | None = None
 
@@ -134,10 +140,10 @@ def recorded_experiment(
     solution: str,
     jobs: int,
     say: Callable[[str], None] = _ignore,
-) -> Made:
+) -> ExperimentResult:
     """Run the experiment; what is in `out` of the same inputs is not made again. Writes tables, pictures and a page.
 
-    `say` is told how many injections there are, and how long they will take, before the first of them.
+    `say` gets the text of how many injections there are, and how long they will take, before the first of them.
     """
     if not runs or site is None:
         raise UsageError("needs recorded runs and --site", place="experiment recorded")
@@ -147,7 +153,7 @@ def recorded_experiment(
     inputs = _inputs(runs, site, vehicle, config, solution, plan, banks_of(plan, plan_file, config))
     # An earlier call may have found other runs at these addresses.
     _KEPT.clear()
-    surveyed = _each_once(mapped(_survey, [(inputs, run) for run in inputs.runs], jobs))
+    surveyed = _without_copies(mapped(_survey, [(inputs, run) for run in inputs.runs], jobs))
     rooms = [one.room for one in surveyed if one.room is not None]
     if not rooms:
         raise next(one.error for one in surveyed if one.error is not None)
@@ -157,11 +163,11 @@ def recorded_experiment(
     digests = {one.run_id: one.run_digest for one in surveyed}
     onsets = numbered(cells, drawn)
     pieces = _pieces(inputs, onsets, digests, out)
-    say(_ahead(onsets, pieces, surveyed, len(inputs.banks), jobs))
-    tables = _tables(mapped(_made_piece, pieces, jobs), surveyed, cells, plan, [bank.name for bank in inputs.banks])
+    say(_estimate(onsets, pieces, surveyed, len(inputs.banks), jobs))
+    tables = _tables(mapped(_replay_piece, pieces, jobs), surveyed, cells, plan, [bank.name for bank in inputs.banks])
     files = _write(out, tables, plan)
-    _forget_others(pieces, out)
-    return Made(tables, {one.run_id: str(one.error) for one in surveyed if one.error is not None}, files)
+    _remove_others(pieces, out)
+    return ExperimentResult(tables, {one.run_id: str(one.error) for one in surveyed if one.error is not None}, files)
 
 
 def _inputs(
@@ -202,10 +208,12 @@ def _survey(task: tuple[Inputs, tuple[str, str]]) -> _Surveyed:
         "has_ranges": room.has_ranges,
     }
     replays_s = time.perf_counter() - begin_s
-    return _Surveyed(run_id, row, replays_s, room, tuple(map(_quiet, baselines)), first.run.input_digest)
+    return _Surveyed(
+        run_id, row, replays_s, room, tuple(base.fault_free() for base in baselines), first.run.input_digest
+    )
 
 
-def _ahead(
+def _estimate(
     onsets: Sequence[Onset], pieces: Sequence[_Piece], surveyed: Sequence[_Surveyed], banks: int, jobs: int
 ) -> str:
     """How much there is to do: each injection takes as long as its run did without a fault."""
@@ -223,7 +231,7 @@ def _unusable(run_id: str, error: InputError) -> _Surveyed:
     return _Surveyed(run_id, row, error=error)
 
 
-def _each_once(surveyed: Sequence[_Surveyed]) -> list[_Surveyed]:
+def _without_copies(surveyed: Sequence[_Surveyed]) -> list[_Surveyed]:
     """A copy of a run is no further pass, and no further hour."""
     first: dict[str, str] = {}
     kept = []
@@ -232,12 +240,6 @@ def _each_once(surveyed: Sequence[_Surveyed]) -> list[_Surveyed]:
         copy = InputError("is a copy of another run", place=one.run_id, found=f"the same bytes as {original}")
         kept.append(one if original == one.run_id else _unusable(one.run_id, copy))
     return kept
-
-
-def _quiet(base: Baseline) -> Quiet:
-    held_s = base.clock.held_s
-    tvb_s = float(held_s[flags(base.epochs, "tvb")].sum())
-    return Quiet(base.bank.name, 1, base.hours(), base.alarms.height, tvb_s, float(held_s.sum()))
 
 
 _KEPT: dict[tuple[str, str, str], Baseline] = {}
@@ -325,7 +327,7 @@ def _piece(inputs: Inputs, address: str, bank: Bank, onsets: Sequence[Onset], ru
     return _Piece(inputs, address, bank, tuple(onsets), out / _PIECES / f"{name}.parquet")
 
 
-def _made_piece(piece: _Piece) -> Part:
+def _replay_piece(piece: _Piece) -> Part:
     """Replay the injections of a piece, or read what an earlier call made of them."""
     content = storage.content_of(piece.file)
     if content is not None:
@@ -372,39 +374,31 @@ def _tables(
         "cells": of_cells,
         "pmd": pmd_table(injections, banks, cells, plan),
         "places": places_table(injections, cells, plan),
-        "banks": banks_table(injections, [_together(name, surveyed) for name in banks], of_cells, plan),
+        "banks": banks_table(injections, [_sum_over_runs(name, surveyed) for name in banks], of_cells, plan),
         "runs": conform(pl.DataFrame(runs, schema=dtypes(ExperimentRuns)), ExperimentRuns),
     }
 
 
-def _together(bank: str, surveyed: Sequence[_Surveyed]) -> Quiet:
+def _sum_over_runs(bank: str, surveyed: Sequence[_Surveyed]) -> FaultFree:
     """All runs without a fault, as this bank saw them."""
-    parts = [quiet for one in surveyed for quiet in one.quiet if quiet.bank == bank]
+    parts = [part for one in surveyed for part in one.fault_free if part.bank == bank]
     sums = {name: sum(getattr(part, name) for part in parts) for name in ("hours", "alarms", "tvb_s", "recorded_s")}
-    return Quiet(bank=bank, runs=len(parts), **sums)
+    return FaultFree(bank=bank, runs=len(parts), **sums)
 
 
 def _write(out: Path, tables: dict[str, pl.DataFrame], plan: RecordedPlan) -> list[Path]:
     drawn = pictures(tables)
     contents = {PAGE: recorded_page(tables, drawn, plan).encode(), "plan.toml": to_toml(plan).encode()}
-    contents |= {f"{name}.parquet": _table_bytes(name, table) for name, table in tables.items()}
+    for name, frame in tables.items():
+        notes = {"table": f"experiment_{name}", "software": SOFTWARE}
+        contents[f"{name}.parquet"] = noted_bytes(frame, notes, EXPERIMENT_TABLES[notes["table"]])
     contents |= {f"{name}.svg": drawing.encode() for name, (_, drawing) in drawn.items()}
     for name, content in contents.items():
         storage.write_bytes(out / name, content)
     return [out / name for name in contents]
 
 
-def _table_bytes(name: str, table: pl.DataFrame) -> bytes:
-    """A table as Parquet, with unit and meaning in the field of each column."""
-    columns = EXPERIMENT_TABLES[f"experiment_{name}"].columns()
-    notes = {
-        column: {"unit": str((kind.metadata or {}).get("unit", "")), "meaning": kind.description or ""}
-        for column, kind in columns.items()
-    }
-    return parquet_bytes(table, {"balise.table": f"experiment_{name}", "balise.software": SOFTWARE}, notes)
-
-
-def _forget_others(pieces: Sequence[_Piece], out: Path) -> None:
+def _remove_others(pieces: Sequence[_Piece], out: Path) -> None:
     """Pieces of other plans, or of other inputs, go."""
     kept = {piece.file.name for piece in pieces}
     for file in (out / _PIECES).glob("*.parquet"):
@@ -421,7 +415,7 @@ def _own_digest() -> str:
     return digest.hexdigest()
 
 
-def shown(made: Made) -> dict[str, pl.DataFrame]:
+def shown(made: ExperimentResult) -> dict[str, pl.DataFrame]:
     """What the screen shows: cells that were replayed, and banks."""
     cells = made.tables["cells"].filter(pl.col("injections") > 0)
     return {"Cells": cells.select(_SHOWN), "Banks": made.tables["banks"].select(_SHOWN_OF_BANKS)}

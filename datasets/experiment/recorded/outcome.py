@@ -1,20 +1,30 @@
-"""What became of one injected fault: noticed when and by what, failed when, in use how long, balises accepted wrong."""
+"""One fault put into a recorded run in memory and replayed to the end of its watch, and what became of it.
+
+Noticed when and by what, failed when, in use how long, balises accepted wrong.
+"""
 
 from __future__ import annotations
+
+from dataclasses import replace
 
 import numpy as np
 import polars as pl
 
-from datasets.experiment.recorded.baseline import Baseline
-from datasets.experiment.recorded.draw import Onset
-from datasets.experiment.recorded.injection import Injected
+from datasets.experiment.recorded.baseline import Baseline, Onset, instant
 from datasets.experiment.tables import Row
-from pipeline.stages.epochs.clock import holds, reactions_ns, unambiguous
+from datasets.faults import FaultKind, FaultSpec
+from datasets.inject import inject
+from pipeline.stages.epochs.clock import reactions_ns
+from pipeline.stages.epochs.monitored import MonitoredEpochs
 from pipeline.stages.judge.epochs import time_in_use
-from pipeline.stages.judge.judgement import RIGHT, UNKNOWN, WRONG
-from schemas.arrays import NS_PER_S, Bools, Floats, Ints, flags, floats, ints, runs_of, times_ns
-from schemas.enums import MonitorState
+from pipeline.stages.judge.judged import RIGHT, UNKNOWN, WRONG
+from pipeline.stages.monitored import MonitoredSolution, monitor_solution
+from pipeline.stages.prepare import PreparedRun, prepare
+from pipeline.studies.plausibility.fit import clock_advice
+from schemas.arrays import NS_PER_S, Bools, Floats, Ints, flags, floats, ints, runs_of
+from schemas.errors import InputError
 from schemas.frozen import frozen
+from schemas.run import RunLog
 from schemas.tables import MONITORS, SCALES
 
 # Epochs before the onset that the time in use is reckoned from: a negation in force there has no part in it.
@@ -24,33 +34,104 @@ _LASTING_S = 1.0
 
 
 @frozen
-class Watch:
-    """The epochs of an injected run from a little before the onset on, beside those of the fault-free run.
+class Injected:
+    """The fault as a fault file of `balise inject` would hold it, and what the train made of it."""
 
-    `moved_m`: by what the fault has moved the position in the direction of travel, NaN where not known; `low_m`,
-    `high_m`: the error; `code`: the judgement; `doubtful`: it may be wrong, and by the fault; `begin`: the first epoch
-    of the fault.
+    fault: FaultSpec
+    monitored: MonitoredSolution
+    end_ns: int
+
+
+def injected(base: Baseline, onset: Onset) -> Injected:
+    """Put the fault in and replay. Raises `InputError` where the recording cannot take it there."""
+    cell = onset.cell
+    start_s = (onset.t_ns - base.recording.first_ns) / NS_PER_S
+    fault = cell.spec(start_s, _satellite(base, onset) if cell.hits_satellite else None)
+    end_ns = onset.t_ns + round(cell.watch_s * NS_PER_S)
+    faulty = _odometer_hit(base, fault, end_ns) if cell.hits_odometer else _gnss_hit(base, fault, onset.t_ns, end_ns)
+    # The monitor that compares two solutions needs both.
+    named = (base.solution, base.config.monitors.channel_reference)
+    matches = {name: faulty.match(name) for name in faulty.run.solutions() if name in named}
+    return Injected(fault, monitor_solution(faulty, base.solution, matches, base.evidence), end_ns)
+
+
+def _satellite(base: Baseline, onset: Onset) -> str:
+    used = base.satellites_at(onset.t_ns)
+    if not used:
+        raise InputError("has no used satellite at the instant drawn", place=f"{onset.run_id}: satellites")
+    return used[int(onset.lot * len(used))]
+
+
+def _gnss_hit(base: Baseline, fault: FaultSpec, begin_ns: int, end_ns: int) -> PreparedRun:
+    """Positions and ranges as cleaned, the fault added from its first epoch on; odometer and reads as they were."""
+    run = base.monitored.prepared.run
+    # A late position is one of before the fault.
+    from_ns = base.recording.first_ns if fault.kind is FaultKind.LATENCY else begin_ns
+    tail = run.with_streams(gnss=_between(run.gnss, from_ns, end_ns), satellites=_cut(run.satellites, begin_ns, end_ns))
+    hit = inject(tail, fault, base.site, base.recording)
+    streams = {
+        "gnss": pl.concat([_before(run.gnss, begin_ns), _between(hit.gnss, begin_ns, end_ns)]),
+        "satellites": None if run.satellites is None else _append_hit(run.satellites, hit.satellites, begin_ns),
+    }
+    return replace(base.monitored.prepared, run=run.with_streams(**streams))
+
+
+def _odometer_hit(base: Baseline, fault: FaultSpec, end_ns: int) -> PreparedRun:
+    """All odometers with the fault; positions as recorded, to the end of the watch."""
+    prepared = base.monitored.prepared
+    first_ns = base.recording.first_ns
+    hit = inject(base.run, fault, base.site, base.recording)
+    cut = RunLog.with_streams(
+        hit, gnss=_between(hit.gnss, first_ns, end_ns), satellites=_cut(hit.satellites, first_ns, end_ns), faults=None
+    )
+    return prepare(cut, base.site, prepared.vehicle, prepared.config, clock_advice)
+
+
+def _append_hit(recorded: pl.DataFrame, hit: pl.DataFrame | None, begin_ns: int) -> pl.DataFrame:
+    before = _before(recorded, begin_ns)
+    return before if hit is None else pl.concat([before, hit])
+
+
+def _before(frame: pl.DataFrame, begin_ns: int) -> pl.DataFrame:
+    return frame.filter(pl.col("t") < instant(begin_ns))
+
+
+def _between(frame: pl.DataFrame, begin_ns: int, end_ns: int) -> pl.DataFrame:
+    return frame.filter(pl.col("t").is_between(instant(begin_ns), instant(end_ns)))
+
+
+def _cut(frame: pl.DataFrame | None, begin_ns: int, end_ns: int) -> pl.DataFrame | None:
+    return None if frame is None else _between(frame, begin_ns, end_ns)
+
+
+@frozen
+class Watch:
+    """The epochs of an injected run from a little before the onset on, compared with those of the fault-free run.
+
+    `moved_m`: by what the fault has moved the position in the direction of travel, NaN where not known; `code`:
+    the judgement; `doubtful`: it may be wrong, and by the fault; `begin`: the first epoch of the fault.
     """
 
-    epochs: pl.DataFrame
-    t_ns: Ints
+    epochs: MonitoredEpochs
     moved_m: Floats
-    low_m: Floats
-    high_m: Floats
     code: Ints
     doubtful: Bools
     begin: int
+
+    @property
+    def t_ns(self) -> Ints:
+        return self.epochs.t_ns
 
 
 def outcome_row(base: Baseline, onset: Onset, found: Injected) -> Row:
     """The row of `schemas.experiment.Injections`, but for the bank."""
     watch = _watch(base, onset, found)
     after = watch.t_ns >= onset.t_ns
-    alarm = flags(watch.epochs, "alarm") & after
+    alarm = watch.epochs.alarm & after
     noticed_ns = int(watch.t_ns[alarm.argmax()]) if alarm.any() else None
     failure_ns, may_ns = _failure(watch)
     use = time_in_use(watch.epochs, watch.code, base.config)
-    in_use = flags(use, "in_use") & after
+    in_use = use.in_use & after
     delays_ns = reactions_ns(watch.t_ns, watch.t_ns, base.config)
     stopped_from = np.inf if noticed_ns is None else noticed_ns + int(delays_ns[alarm.argmax()])
     unnoticed = after if noticed_ns is None else after & (watch.t_ns < noticed_ns)
@@ -66,9 +147,9 @@ def outcome_row(base: Baseline, onset: Onset, found: Injected) -> Row:
         "time_to_failure_may_s": _seconds(may_ns, onset.t_ns),
         "time_since_failure_s": _seconds(noticed_ns, failure_ns),
         "time_since_failure_may_s": _seconds(noticed_ns, may_ns),
-        "stopped": _stopped(watch, flags(use, "in_use"), stopped_from) if noticed_ns is not None else None,
-        "hazardous_s": float(floats(use, "wrong_s")[after].sum()),
-        "hazardous_may_s": float(floats(use, "used_s")[after & (watch.code != RIGHT)].sum()),
+        "stopped": _stopped(watch, use.in_use, stopped_from) if noticed_ns is not None else None,
+        "hazardous_s": float(use.wrong_s[after].sum()),
+        "hazardous_may_s": float(use.used_s[after & (watch.code != RIGHT)].sum()),
         "unnoticed_m": _largest(watch.moved_m, unnoticed),
         "in_use_m": _largest(watch.moved_m, in_use),
         "tvb_lost_s": _tvb_lost_s(base, watch, onset, found.end_ns),
@@ -79,33 +160,39 @@ def outcome_row(base: Baseline, onset: Onset, found: Injected) -> Row:
 def _watch(base: Baseline, onset: Onset, found: Injected) -> Watch:
     lead_ns = onset.t_ns - round(_LEAD_S * NS_PER_S)
     epochs = found.monitored.solution.epochs
-    all_ns = times_ns(epochs)
-    epochs = epochs.filter(pl.Series(all_ns >= lead_ns))
-    t_ns = times_ns(epochs)
+    epochs = epochs.where(np.flatnonzero(epochs.t_ns >= lead_ns))
+    t_ns = epochs.t_ns
     row = np.searchsorted(base.t_ns, t_ns).clip(max=base.t_ns.size - 1)
     same = base.t_ns[row] == t_ns
-    moved_m, astray = _moved_m(base, found, epochs, row)
+    moved_m, astray = _moved_m(base, epochs.element_by(base.monitored.match.path.track.index), epochs.measure_m, row)
     moved_m = np.where(same, moved_m, np.nan)
-    own_low_m, own_high_m = (values[row] for values in base.own_m)
-    low_m = own_low_m + moved_m
-    high_m = own_high_m + moved_m
+    code = _codes(base, row, moved_m, astray & epochs.unambiguous)
+    was_right = _codes(base, row, np.zeros(row.size), np.zeros(row.size, dtype=bool)) == RIGHT
+    beyond = np.abs(moved_m) > base.config.hazards.limits.failure_m
+    doubtful = (code == UNKNOWN) & np.isfinite(moved_m) & (was_right | beyond)
+    return Watch(epochs, moved_m, code, doubtful, int(np.searchsorted(t_ns, onset.t_ns)))
+
+
+def _codes(base: Baseline, row: Ints, moved_m: Floats, astray: Bools) -> Ints:
+    """Judgement of positions at these rows of the fault-free run that the fault has moved; wrong where `astray`.
+
+    The error is an interval: the position's own, by its evidence, and what the fault has added.
+    """
+    low_m, high_m = (own_m[row] + moved_m for own_m in base.own_m)
     limit_m = base.config.hazards.limits.failure_m
-    code = np.full(t_ns.size, UNKNOWN)
-    with np.errstate(invalid="ignore"):
-        code[(low_m >= -limit_m) & (high_m <= limit_m)] = RIGHT
-        code[(low_m > limit_m) | (high_m < -limit_m)] = WRONG
-    code[astray & holds(epochs, unambiguous())] = WRONG
-    was_right = (own_low_m >= -limit_m) & (own_high_m <= limit_m)
-    doubtful = (code == UNKNOWN) & np.isfinite(moved_m) & (was_right | (np.abs(moved_m) > limit_m))
-    return Watch(epochs, t_ns, moved_m, low_m, high_m, code, doubtful, int(np.searchsorted(t_ns, onset.t_ns)))
+    code = np.full(row.size, UNKNOWN)
+    # Comparisons with NaN, an error not known, are false.
+    code[(low_m >= -limit_m) & (high_m <= limit_m)] = RIGHT
+    code[(low_m > limit_m) | (high_m < -limit_m) | astray] = WRONG
+    return code
 
 
-def _moved_m(base: Baseline, found: Injected, epochs: pl.DataFrame, row: Ints) -> tuple[Floats, Bools]:
-    """By what the position lies further along the fault-free run's path [m]; and where it lies off that path."""
+def _moved_m(base: Baseline, number: Ints, measure_m: Floats, row: Ints) -> tuple[Floats, Bools]:
+    """By what positions lie further along the fault-free run's path [m]; and where they lie off that path.
+
+    `number`: of the net element, -1 for none; `row`: the epoch of the fault-free run.
+    """
     path = base.monitored.match.path
-    element = epochs["netelement_id"].replace_strict(path.track.index, default=-1, return_dtype=pl.Int64)
-    number = element.fill_null(-1).to_numpy()
-    measure_m = floats(epochs, "measure_m")
     near_m = floats(base.epochs, "path_m")[row]
     leg = ints(base.epochs["leg"], 0)[row]
     at_m = np.full(number.size, np.nan)
@@ -141,8 +228,7 @@ def _stopped(watch: Watch, in_use: Bools, from_ns: float) -> bool:
 
 
 def _failing(watch: Watch, epoch: int) -> list[str]:
-    states = watch.epochs.row(epoch, named=True)
-    return [name for name in MONITORS if states.get(f"{name}_state") == MonitorState.FAIL.value]
+    return [name for name in MONITORS if watch.epochs.verdicts[name].fails[epoch]]
 
 
 def _largest(moved_m: Floats, where: Bools) -> float:
@@ -153,34 +239,29 @@ def _tvb_lost_s(base: Baseline, watch: Watch, onset: Onset, end_ns: int) -> floa
     """Time with a TVB in the fault-free run less that with the fault, over the watch [s]."""
     there = (base.t_ns >= onset.t_ns) & (base.t_ns <= end_ns) & flags(base.epochs, "tvb")
     had = set(base.t_ns[there].tolist())
-    has = set(watch.t_ns[(watch.t_ns >= onset.t_ns) & flags(watch.epochs, "tvb")].tolist())
+    has = set(watch.t_ns[(watch.t_ns >= onset.t_ns) & watch.epochs.tvb].tolist())
     period_s = base.clock.period_s or 0.0
     return len(had - has) * period_s
 
 
 def _accepted(base: Baseline, onset: Onset, found: Injected) -> Row:
     """Balises accepted since the onset, and of them those whose position was wrong there, or may have been."""
-    accepted = found.monitored.solution.accepted.filter(
-        pl.col("t") >= pl.lit(onset.t_ns).cast(pl.Datetime("ns", "UTC"))
-    )
-    t_ns = times_ns(accepted)
+    crossings = found.monitored.solution.crossings
+    accepted = np.flatnonzero(crossings.accepted & (crossings.t_ns >= onset.t_ns))
+    t_ns = crossings.t_ns[accepted]
     row = np.searchsorted(base.t_ns, t_ns).clip(max=base.t_ns.size - 1)
     train_m, sense = _train_at(base, t_ns, row)
-    at_m, astray = _moved_m(base, found, accepted, row)
+    index = base.monitored.match.path.track.index
+    elements = [index.get(crossings.netelement_id[number], -1) for number in accepted.tolist()]
+    at_m, astray = _moved_m(base, np.array(elements, dtype=np.int64), crossings.measure_m[accepted], row)
     at_m = at_m * sense + floats(base.epochs, "path_m")[row]
-    own_low_m, own_high_m = (values[row] for values in base.own_m)
-    moved_m = (at_m - train_m) * sense
-    limit_m = base.config.hazards.limits.failure_m
-    low_m = own_low_m + moved_m
-    high_m = own_high_m + moved_m
-    wrong = (low_m > limit_m) | (high_m < -limit_m) | astray
-    right = (low_m >= -limit_m) & (high_m <= limit_m)
-    ids = accepted["balise_id"]
+    code = _codes(base, row, (at_m - train_m) * sense, astray)
+    wrong = accepted[code == WRONG]
     return {
-        "accepted": accepted.height,
-        "accepted_wrong": int(wrong.sum()),
-        "accepted_unknown": int((~wrong & ~right).sum()),
-        "accepted_wrong_ids": ids.filter(pl.Series(wrong, dtype=pl.Boolean)).to_list(),
+        "accepted": accepted.size,
+        "accepted_wrong": wrong.size,
+        "accepted_unknown": int((code == UNKNOWN).sum()),
+        "accepted_wrong_ids": [crossings.balise_id[number] for number in wrong.tolist()],
     }
 
 
@@ -193,17 +274,12 @@ def _train_at(base: Baseline, t_ns: Ints, row: Ints) -> tuple[Floats, Ints]:
 
 
 def _what(onset: Onset, found: Injected) -> Row:
-    cell = onset.cell
     return {
+        **onset.cell.labels,
         "injection_id": onset.number,
-        "cell": cell.name,
         "run_id": onset.run_id,
         "solution": found.monitored.solution.name,
-        "kind": cell.fault.kind.value,
         "target": found.fault.target,
-        "direction": cell.direction,
-        "amount": cell.amount,
-        "unit": cell.fault.unit,
         "duration_s": found.fault.duration_s,
         "start_s": found.fault.start_s,
     }
@@ -213,8 +289,7 @@ def _where(base: Baseline, onset: Onset) -> Row:
     """The place and what the bank knew there, in the fault-free run."""
     epoch = base.epochs.row(int(np.searchsorted(base.t_ns, onset.t_ns)), named=True)
     fixes = base.monitored.solution.fixes
-    stamp = pl.lit(onset.t_ns).cast(pl.Datetime("ns", "UTC"))
-    satellites = fixes.filter(pl.col("t") == stamp)["satellites"].to_list()
+    satellites = fixes.filter(pl.col("t") == instant(onset.t_ns))["satellites"].to_list()
     kept = ("netelement_id", "measure_m", "path_m", "speed_mps", "curvature_per_m", "sigma_along_m")
     thresholds = {f"along_{scale}_threshold": epoch[f"along_{scale}_threshold"] for scale in SCALES}
     return {name: epoch[name] for name in kept} | {"satellites": satellites[0] if satellites else None} | thresholds

@@ -35,7 +35,7 @@ _AMOUNTS = {
 """Per kind its list in the plan, the quantity of the fault, and its unit."""
 _LISTS = ("rates_mps", "sizes_m", "durations_s", "latencies_s", "scales")
 _SIGNED = (FaultKind.RAMP, FaultKind.STEP, FaultKind.BIAS)
-_WAYS = {
+_DIRECTIONS = {
     "along": ("ahead", "behind"),
     "cross": ("left", "right"),
     "up": ("up", "down"),
@@ -82,6 +82,7 @@ class PlannedFault(Settings):
 
     @property
     def amounts(self) -> Amounts:
+        """All that the plan asks of it, in `unit`."""
         amounts: Amounts = getattr(self, _AMOUNTS[self.kind][0])
         return amounts
 
@@ -98,7 +99,7 @@ class PlannedFault(Settings):
 
 
 class PlannedBank(Settings):
-    """A bank of the comparison: a configuration file, seen from the plan; `vehicle` in place of the command's."""
+    """A bank of the comparison: a configuration file, relative to the plan; `vehicle` in place of the command's."""
 
     name: Annotated[str, Field(pattern=r"^[A-Za-z0-9_.-]+$")]
     config: str
@@ -167,7 +168,14 @@ class Cell:
         return _direction(self.fault, self.target, self.amount)
 
     @property
+    def labels(self) -> dict[str, object]:
+        """What names the cell in every table."""
+        named = {"cell": self.name, "kind": self.fault.kind.value, "target": self.target, "direction": self.direction}
+        return named | {"amount": self.amount, "unit": self.fault.unit}
+
+    @property
     def hits_satellite(self) -> bool:
+        """It hits the range of one satellite, drawn for each injection."""
         return self.fault.target == SATELLITE
 
     @property
@@ -176,9 +184,11 @@ class Cell:
 
     @property
     def target(self) -> str:
+        """As in a fault file, or `satellite`."""
         return SATELLITE if self.hits_satellite else self.spec(1.0, None).target
 
     def spec(self, start_s: float, satellite: str | None) -> FaultSpec:
+        """The fault as a fault file would hold it, from `start_s` after the first epoch on."""
         return self.fault.spec(self.amount, start_s, satellite)
 
 
@@ -188,8 +198,8 @@ def _cells(plan: RecordedPlan, fault: PlannedFault, limit_m: float) -> Iterator[
         for sign in signs:
             target = SATELLITE if fault.target == SATELLITE else fault.spec(amount, 1.0, "G01").target
             words = [fault.kind.value, target, f"{amount:g} {fault.unit}"]
-            way = _direction(fault, target, sign)
-            words += [] if way is None else [way]
+            direction = _direction(fault, target, sign)
+            words += [] if direction is None else [direction]
             words += [f"for {fault.duration_s:g} s"] if fault.duration_s is not None else []
             words += [f"in {fault.solution}"] if fault.solution is not None else []
             yield Cell(
@@ -204,7 +214,7 @@ def _cells(plan: RecordedPlan, fault: PlannedFault, limit_m: float) -> Iterator[
 def _direction(fault: PlannedFault, target: str, amount: float) -> str | None:
     if fault.kind not in _SIGNED:
         return None
-    more, less = _WAYS.get(target, ("longer", "shorter"))
+    more, less = _DIRECTIONS.get(target, ("longer", "shorter"))
     return more if amount > 0.0 else less
 
 

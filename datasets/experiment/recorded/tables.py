@@ -1,7 +1,7 @@
 """The injections as figures: per cell, Pmd against T_dsf, by place, and bank against bank.
 
 Counting. All injections of a cell are watched for equally long, so the Kaplan-Meier curve is the plain share not yet
-noticed, and T_D beyond the watch is only known to be longer: no quantile is told from it. Injections whose watches
+noticed, and T_D beyond the watch is only known to be longer: no quantile is given from it. Injections whose watches
 overlap share the noise that decides them. So a share is that of all injections, and its bounds are those of Clopper and
 Pearson on as many trials as there are passes: watches of one run that neither overlap nor are shorter than `pass_s`.
 """
@@ -15,30 +15,18 @@ import numpy as np
 import polars as pl
 from scipy.special import betaincinv
 
+from datasets.experiment.recorded.baseline import FaultFree
 from datasets.experiment.recorded.plan import Cell, RecordedPlan
 from datasets.experiment.tables import Row
 from pipeline.stages.run_row.bounds import CONFIDENCE, UNKNOWN, columns_of, poisson_rate
 from schemas.arrays import NS_PER_S, Floats, floats, times_ns
 from schemas.conform import conform
 from schemas.experiment import ExperimentBanks, ExperimentCells, ExperimentPlaces, ExperimentPmd
-from schemas.frozen import frozen
 
 _PMD_STEPS = 40
 _QUANTILES = {"median": 0.5, "p95": 0.95, "max": 1.0}
 # Shares of few passes are whole numbers of them but for rounding.
 _ROUNDING = 1e-9
-
-
-@frozen
-class Quiet:
-    """One bank on the recorded runs without a fault: alarms in so many hours, share of time with a TVB."""
-
-    bank: str
-    runs: int
-    hours: float
-    alarms: int
-    tvb_s: float
-    recorded_s: float
 
 
 class Passes(NamedTuple):
@@ -108,7 +96,8 @@ def _cell_row(cell: Cell, bank: str, frame: pl.DataFrame, lost: pl.DataFrame, pl
     short = cell.count - frame.height - lost.height
     reason = f"{short} found no room in the runs" if short else None
     return {
-        **_names(cell, bank),
+        "bank": bank,
+        **cell.labels,
         "wanted": cell.count,
         "injections": frame.height,
         "not_possible": lost.height,
@@ -128,18 +117,6 @@ def _cell_row(cell: Cell, bank: str, frame: pl.DataFrame, lost: pl.DataFrame, pl
         "unnoticed_max_m": frame["unnoticed_m"].max(),
         "in_use_max_m": frame["in_use_m"].max(),
         "tvb_lost_median_s": frame["tvb_lost_s"].median(),
-    }
-
-
-def _names(cell: Cell, bank: str) -> Row:
-    return {
-        "bank": bank,
-        "cell": cell.name,
-        "kind": cell.fault.kind.value,
-        "target": cell.target,
-        "direction": cell.direction,
-        "amount": cell.amount,
-        "unit": cell.fault.unit,
     }
 
 
@@ -198,7 +175,8 @@ def _pmd_rows(injections: pl.DataFrame, bank: str, cell: Cell, plan: RecordedPla
     for time_s in _times_since_failure_s(failed).tolist():
         missed = _missed(failed, time_s, "time_since_failure_may_s")
         yield {
-            **_names(cell, bank),
+            "bank": bank,
+            **cell.labels,
             "time_since_failure_s": time_s,
             "trials": failed.height,
             "passes": independent.number,
@@ -252,14 +230,14 @@ def places_table(injections: pl.DataFrame, cells: Sequence[Cell], plan: Recorded
 
 
 def banks_table(
-    injections: pl.DataFrame, quiet: Sequence[Quiet], cells: pl.DataFrame, plan: RecordedPlan
+    injections: pl.DataFrame, fault_free: Sequence[FaultFree], cells: pl.DataFrame, plan: RecordedPlan
 ) -> pl.DataFrame:
     """Detection against false alarms, bank by bank."""
-    rows = [_bank_row(injections.filter(bank=one.bank), one, cells.filter(bank=one.bank), plan) for one in quiet]
+    rows = [_bank_row(injections.filter(bank=one.bank), one, cells.filter(bank=one.bank), plan) for one in fault_free]
     return conform(pl.DataFrame(rows, infer_schema_length=None), ExperimentBanks)
 
 
-def _bank_row(frame: pl.DataFrame, quiet: Quiet, cells: pl.DataFrame, plan: RecordedPlan) -> Row:
+def _bank_row(frame: pl.DataFrame, fault_free: FaultFree, cells: pl.DataFrame, plan: RecordedPlan) -> Row:
     failed = _failed(frame)
     independent = passes(failed, plan.pass_s)
     missed = _missed(failed, 0.0, "time_since_failure_may_s")
@@ -267,12 +245,12 @@ def _bank_row(frame: pl.DataFrame, quiet: Quiet, cells: pl.DataFrame, plan: Reco
         pl.col("time_to_detect_median_s").fill_null(np.inf), descending=True, maintain_order=True
     )
     return {
-        "bank": quiet.bank,
-        "runs": quiet.runs,
-        "hours": quiet.hours,
-        "alarms": quiet.alarms,
-        **columns_of("alarm_rate", poisson_rate(quiet.alarms, quiet.hours), "_per_h"),
-        "tvb_share": quiet.tvb_s / quiet.recorded_s if quiet.recorded_s else None,
+        "bank": fault_free.bank,
+        "runs": fault_free.runs,
+        "hours": fault_free.hours,
+        "alarms": fault_free.alarms,
+        **columns_of("alarm_rate", poisson_rate(fault_free.alarms, fault_free.hours), "_per_h"),
+        "tvb_share": fault_free.tvb_s / fault_free.recorded_s if fault_free.recorded_s else None,
         "injections": frame.height,
         "passes": independent.number,
         "noticed": int(frame["noticed"].sum()),

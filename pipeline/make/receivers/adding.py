@@ -93,6 +93,7 @@ def added(run: RunLog, streams: Streams, force: bool, place: Path) -> RunLog:
 
 
 def _add_rows(name: Stream, old: pl.DataFrame, new: pl.DataFrame, force: bool, place: Path) -> pl.DataFrame:
+    """Rows of a stream with those to add; of a solution there already only if forced."""
     by_solution = name in BY_SOLUTION
     shared = sorted(set(old["solution"]) & set(new["solution"])) if by_solution else [name]
     if shared and not force:
@@ -106,6 +107,7 @@ def _add_rows(name: Stream, old: pl.DataFrame, new: pl.DataFrame, force: bool, p
 
 
 def _refuse_other_times(run: RunLog, name: Stream, new: pl.DataFrame, place: Path) -> None:
+    """Refuse positions of a time that does not overlap the run."""
     run_t = run.gnss["t"].drop_nulls()
     new_t = new.to_series(0).drop_nulls()
     if len(run_t) and len(new_t) and (new_t.max() < run_t.min() or new_t.min() > run_t.max()):  # type: ignore[operator]

@@ -52,6 +52,7 @@ def unpacker_of(bag: Any, place: str, config: IngestConfig) -> Unpack:
 
 
 def _bounded_chunk(chunk: Any, place: str, config: IngestConfig) -> Any:
+    """A chunk of a ROS 1 bag that unpacks no more than the limit."""
     from lz4 import frame as lz4
 
     openers = {bz2.decompress: bz2.open, lz4.decompress: lz4.open}
@@ -60,6 +61,7 @@ def _bounded_chunk(chunk: Any, place: str, config: IngestConfig) -> Any:
 
 
 def _bounded(opener: Callable[[BytesIO], Any], place: str, config: IngestConfig) -> Unpack:
+    """An unpacking that stops at the limit."""
     most = int(config.chunk_limit_mib * _MIB)
 
     def unpack(packed: bytes) -> bytes:

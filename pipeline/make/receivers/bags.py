@@ -76,6 +76,7 @@ def describe_bag(path: Path, config: IngestConfig) -> LogDescription:
 
 
 def _topics_alone(path: Path, config: IngestConfig) -> tuple[TopicSummary, ...]:
+    """Topics of a bag, without its messages if that can be."""
     try:
         if path.is_dir() and (declared := declared_of(path)) is not None and declared.mcap:
             return topics_of(files_of(path, declared), config)
@@ -107,8 +108,8 @@ def declared_of(folder: Path) -> Declared | None:
     except ImportError:
         return None
     try:
-        told = YAML(typ="safe", pure=True).load((folder / "metadata.yaml").read_text(encoding="utf-8"))
-        bag = told["rosbag2_bagfile_information"]
+        metadata = YAML(typ="safe", pure=True).load((folder / "metadata.yaml").read_text(encoding="utf-8"))
+        bag = metadata["rosbag2_bagfile_information"]
         # Older writers name the folder too.
         names = tuple(PurePosixPath(str(name)).name for name in bag["relative_file_paths"])
         packed = str(bag.get("compression_mode") or "").upper() in ("FILE", "MESSAGE")
@@ -158,13 +159,14 @@ def _absent(folder: Path, declared: Declared, found: Sequence[Path]) -> Iterator
 
 
 def _undeclared(folder: Path, declared: Declared) -> Iterator[str]:
-    beside = sorted(path.name for path in folder.iterdir() if path.suffix in (".mcap", ".db3"))
+    """Files next to a bag that its description does not name."""
+    others = sorted(path.name for path in folder.iterdir() if path.suffix in (".mcap", ".db3"))
     known = {name.removesuffix(".zstd") for name in declared.files}
-    yield from (f"{name} is not declared, and not read" for name in beside if name not in known)
+    yield from (f"{name} is not declared, and not read" for name in others if name not in known)
 
 
 def _fewer(declared: Declared, counts: Mapping[str, int]) -> Iterator[str]:
-    """Topics of which fewer messages were met than are declared."""
+    """Topics of which fewer messages were found than are declared."""
     lost = {topic: wanted for topic, wanted in sorted(declared.topics.items()) if counts.get(topic, 0) < wanted}
     for topic, wanted in lost.items():
         yield f"holds {counts.get(topic, 0)} of {wanted} messages of {topic} that are declared"
@@ -173,6 +175,7 @@ def _fewer(declared: Declared, counts: Mapping[str, int]) -> Iterator[str]:
 
 
 def _with_rest(run: RunLog, left: dict[str, int]) -> tuple[RunLog, dict[str, int]]:
+    """A run with what was not used of its log."""
     if run.notes.damage is not None:
         left = left | {f"end of the log, {run.notes.damage}": 1}
     return run, left | {f"topic {topic}": 1 for topic in run.notes.skipped_topics}
@@ -216,6 +219,7 @@ def _transcribe(path: Path, to: Path, config: IngestConfig) -> tuple[dict[str, i
 
 
 def _write(bag: Any, to: Path, unpack: Unpack, budget: Budget) -> tuple[dict[str, int], dict[str, int]]:
+    """Write all messages of a bag as MCAP."""
     from mcap.writer import CompressionType, Writer
 
     left: dict[str, int] = {}
@@ -258,6 +262,7 @@ def _without_sequence(known: Any) -> Any:
 
 
 def _definition(types: Any, name: str) -> str | None:
+    """Definition of a message type, if it is known."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         try:

@@ -4,23 +4,19 @@ from __future__ import annotations
 
 import re
 from collections import Counter
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from datetime import date
 from itertools import pairwise
 from pathlib import Path
-from typing import Any
 
 import polars as pl
 
-from pipeline.make.receivers import nmea, novatel, sbf, ubx
 from pipeline.make.receivers.adding import BY_SOLUTION, Purpose, Streams, added, assigned
 from pipeline.make.receivers.bags import is_bag, read_bag
 from pipeline.make.receivers.csv import TABLES, names_file, read_csv
-from pipeline.make.receivers.epochs import Epochs, Gathered
-from pipeline.make.receivers.frames import Frame, Protocol, frames, name_of
 from pipeline.make.receivers.gpsd import is_gpsd, objects_in, read_gpsd
-from pipeline.make.receivers.rivals import sees_twins, two_receivers
+from pipeline.make.receivers.messages import NoEpochError, UnknownError, read_messages, reasons_text
 from pipeline.make.receivers.rtklib import is_solution, parts_of_solution, read_solution
 from pipeline.make.receivers.unpack import BAG_FOLDER, unpacked
 from pipeline.read.ingest.conform import conform, refuse
@@ -44,7 +40,7 @@ class Converted:
     parts: tuple[LogPart, ...] = ()
 
     def made_of(self, logs: Sequence[FileDigest]) -> Converted:
-        """The run with the logs that were read for it, beside those that it was made of before."""
+        """The run with the logs that were read for it, and those that it was made of before."""
         listed = dict.fromkeys([*self.run.notes.raw_logs, *((log.name, log.size_bytes, log.sha256) for log in logs)])
         return replace(self, run=replace(self.run, notes=replace(self.run.notes, raw_logs=tuple(listed))))
 
@@ -54,7 +50,19 @@ class Converted:
 
 
 def convert(logs: list[Path], run_id: str, config: IngestConfig | None = None) -> Converted:
-    """Receiver logs of one journey as one new run: `gather` and `as_run`."""
+    """Receiver logs of one journey as one new run: `gather` and `as_run`.
+
+    Args:
+        logs: files of one journey.
+        run_id: id of the run.
+        config: the section `ingest` of the configuration; None: the defaults.
+
+    Returns:
+        The run, and what was left out.
+
+    Raises:
+        InputError: no log holds an epoch.
+    """
     return as_run(gather(logs, config), run_id)
 
 
@@ -65,7 +73,21 @@ def as_run(
     sigmas: FixSigma | None = None,
     correct: Sequence[StreamCorrection] = (),
 ) -> Converted:
-    """A new run of what logs hold, positions as `purpose` says, corrected; raises `InputError` without positions."""
+    """Make a new run of what logs hold.
+
+    Args:
+        logs: what the logs hold, as `gather` yields it.
+        run_id: id of the run.
+        purpose: which stream the positions become; None: `gnss`.
+        sigmas: standard deviations by kind of fix, where a log states none [m].
+        correct: corrections of streams.
+
+    Returns:
+        The run, and what was left out.
+
+    Raises:
+        InputError: the logs hold no position.
+    """
     streams = assigned(logs.streams, purpose or Purpose(), sigmas or FixSigma())
     if "gnss" not in streams:
         raise InputError(
@@ -73,7 +95,7 @@ def as_run(
             place=run_id,
             found=", ".join(streams) or None,
             expected="GNSS positions, which a new run needs",
-            remedy="Convert the log of the receiver first or in the same call." + _reasons(logs.dropped),
+            remedy="Convert the log of the receiver first or in the same call." + reasons_text(logs.dropped),
         )
     held = logs.corrections_as(purpose or Purpose())
     notes = IngestNotes(damage=logs.damage, corrections=held)
@@ -90,7 +112,23 @@ def extended(
     force: bool,
     correct: Sequence[StreamCorrection] = (),
 ) -> Converted:
-    """A run that stands at a place, with what logs hold added to it; both are corrected first."""
+    """Add what logs hold to a run; both are corrected first.
+
+    Args:
+        run: the run as it stands.
+        place: its path, for errors.
+        logs: what the logs hold, as `gather` yields it.
+        purpose: which stream the positions become.
+        sigmas: standard deviations by kind of fix, where a log states none [m].
+        force: replace streams that the run has already.
+        correct: corrections of streams.
+
+    Returns:
+        The run with the streams added, and what was left out.
+
+    Raises:
+        InputError: the run has a stream already, or its corrections differ.
+    """
     streams = assigned(logs.streams, purpose, sigmas)
     notes = IngestNotes(corrections=logs.corrections_as(purpose))
     bare = RunLog(run.run_id, run.gnss.clear(), notes=notes).with_streams(**streams)
@@ -109,13 +147,13 @@ def extended(
 def _refuse_unlike(
     one: Sequence[StreamCorrection], other: Sequence[StreamCorrection], stream: Stream, place: Path
 ) -> None:
-    """Rows of one stream that were corrected in different ways could not be told apart."""
+    """Refuse rows of one stream that were corrected in different ways: nothing would distinguish them."""
     if one != other:
-        ways = [", ".join(made.changes for made in held) or "none" for held in (one, other)]
+        changes = [", ".join(made.changes for made in held) or "none" for held in (one, other)]
         raise InputError(
             f"receivers of one {stream} with different corrections",
             place=str(place),
-            found=" and ".join(ways),
+            found=" and ".join(changes),
             remedy="Convert them with one configuration; `solution` in [[ingest.correct]] names which it is for.",
         )
 
@@ -125,8 +163,7 @@ class Gatherings:
     """The streams of all logs, as the contract has them, and what could not be used: reason to number.
 
     `corrections`: those that the streams hold already, of logs that are runs of this program; `damage`: what the logs
-    lack; `parts`: what they consist of, and what of it is used; `topics`: of
-    a bag, those that it holds.
+    lack; `parts`: what they consist of, and what of it is used; `topics`: of a bag, those that it holds.
     """
 
     streams: Streams
@@ -137,7 +174,7 @@ class Gatherings:
     topics: tuple[str, ...] = ()
 
     def corrections_as(self, purpose: Purpose) -> tuple[StreamCorrection, ...]:
-        """Those of the streams as they are meant: positions that become the reference are no stream `gnss` any more."""
+        """Corrections of the streams as they are meant: positions that become the reference are no `gnss` any more."""
         lost = BY_SOLUTION if purpose.stream == "reference" else ()
         return tuple(made for made in self.corrections if made.stream not in lost)
 
@@ -151,11 +188,19 @@ def gathered_of(run: RunLog, dropped: Mapping[str, int]) -> Gatherings:
 def gather(
     logs: list[Path], config: IngestConfig | None = None, date: date | None = None, solution: str | None = None
 ) -> Gatherings:
-    """What the logs hold: positions, or whatever else a mapping or a topic makes a stream of.
+    """Read what the logs hold.
 
-    `date`: the day of the first sentence, for NMEA logs that hold none. `solution`: the talker or device that is meant,
-    where a log holds the positions of two receivers. Raises `InputError` where no log of a receiver
-    holds an epoch, or where two logs tell of the same time under one solution.
+    Args:
+        logs: files, packed or not.
+        config: the section `ingest` of the configuration; None: the defaults.
+        date: the day of the first sentence, for NMEA logs that hold none.
+        solution: the talker or device that is meant, where a log holds the positions of two receivers.
+
+    Returns:
+        Streams of positions, or whatever else a mapping or a topic makes a stream of, and what was left out.
+
+    Raises:
+        InputError: no log of a receiver holds an epoch, or two logs hold the same time under one solution.
     """
     dropped: Counter[str] = Counter()
     parts: list[tuple[Path, Gatherings]] = []
@@ -211,21 +256,16 @@ def _common(parts: list[tuple[Path, Gatherings]]) -> tuple[StreamCorrection, ...
     return tuple(correction for made in common.values() for correction in made)
 
 
-class NoEpochError(InputError):
-    """A log of a receiver whose messages tell no position with a time."""
-
-
-class UnknownError(InputError):
-    """A file without a message of a known receiver."""
-
-
 def said_of(reason: str) -> str:
-    """What became of the records of a reason: some are told and used all the same."""
+    """What became of the records set apart for a reason: some are noted and used all the same.
+
+    Args:
+        reason: why records were set apart.
+
+    Returns:
+        `noted` or `not used`.
+    """
     return "noted" if re.search(r"\((kept|put right)", reason) else "not used"
-
-
-def _reasons(dropped: Mapping[str, int]) -> str:
-    return "".join(f" Not used: {reason} ({count})." for reason, count in sorted(dropped.items()))
 
 
 def _concat_streams(parts: list[tuple[Path, Gatherings]]) -> Streams:
@@ -278,7 +318,7 @@ def _refuse_overlaps(parts: list[tuple[Path, Gatherings]]) -> None:
 
 
 def _spans(log: Path, frame: pl.DataFrame, key: str, columns: tuple[str, ...]) -> Iterator[pl.DataFrame]:
-    """From when to when a log holds values, by recorder; a frame for each of the columns."""
+    """Times from when to when a log holds values, by recorder; a frame for each of the columns."""
     named = frame if key in frame.columns else frame.with_columns(pl.lit("primary").alias(key))
     for column in columns or ("t",):
         if column in named.columns:
@@ -288,6 +328,7 @@ def _spans(log: Path, frame: pl.DataFrame, key: str, columns: tuple[str, ...]) -
 
 
 def _convert_one(log: Path, config: IngestConfig, date: date | None, solution: str | None) -> Gatherings:
+    """What one file of a receiver gives."""
     if is_bag(log):
         # Corrections are made of the whole, once.
         own = of_topics(config, log)
@@ -312,7 +353,8 @@ def _convert_one(log: Path, config: IngestConfig, date: date | None, solution: s
         streams, dropped = read_gpsd(content, log, solution)
         if streams["gnss"].height:
             return Gatherings(streams, dropped, parts=tuple(parts_of_messages(log.name, objects_in(content))))
-    return _read(content, log, date, solution)
+    found, left, parts = read_messages(content, log, date, solution)
+    return Gatherings(found, left, parts=parts)
 
 
 def of_topics(config: IngestConfig, log: Path | None = None) -> IngestConfig:
@@ -328,112 +370,3 @@ def of_topics(config: IngestConfig, log: Path | None = None) -> IngestConfig:
         if stream != "faults"
     }
     return config.model_copy(update=kept)
-
-
-def _read(
-    content: bytes, log: Path, date: date | None, solution: str | None, left_out: frozenset[str] = frozenset()
-) -> Gatherings:
-    """The epochs of the protocol that says most; what is damaged or said twice is counted. `left_out`: talkers."""
-    dropped: Counter[str] = Counter()
-    gathered = {protocol: Gathered() for protocol in _PROTOCOLS}
-    gathered[Protocol.NMEA] = nmea.Sentences(left_out=left_out)
-    named: Counter[tuple[Protocol, str, bool]] = Counter()
-    for frame in frames(content, lambda: dropped.update(["damaged message"]), lambda: dropped.update([_UNCHECKED])):
-        is_used = frame.protocol in gathered and _decode(frame, gathered[frame.protocol])
-        named[frame.protocol, name_of(frame), is_used] += 1
-    twins = {protocol: sees_twins(of) for protocol, of in gathered.items()}
-    ubx.settle_times(gathered[Protocol.UBX])
-    nmea.settle_days(gathered[Protocol.NMEA], date)
-    novatel.settle_source(gathered[Protocol.NOVATEL])
-    settled = {protocol: epochs.settled() for protocol, epochs in gathered.items()}
-    best = max(settled, key=lambda protocol: _worth(protocol, settled[protocol]))
-    for protocol, epochs in settled.items():
-        if protocol is best or not settled[best].positions:
-            dropped.update(gathered[protocol].dropped)
-        elif epochs.positions:
-            dropped[f"{protocol} position beside those of {best}"] += epochs.positions
-    if not settled[best].epochs:
-        raise _no_epoch(content, log, dropped)
-    rivals = gathered[best].rivals
-    if solution in rivals:
-        return _read(content, log, date, None, rivals - {solution})
-    if rivals or twins[best] is not None:
-        raise two_receivers(str(log), rivals, max(gathered[best].widest_m, twins[best] or 0.0))
-    counts = Counter({(name, used and protocol is best): 0 for protocol, name, used in named})
-    for (protocol, name, used), count in named.items():
-        counts[name, used and protocol is best] += count
-    return Gatherings(settled[best].streams(), dropped, parts=tuple(parts_of_messages(log.name, counts)))
-
-
-def _no_epoch(content: bytes, log: Path, dropped: Mapping[str, int]) -> InputError:
-    """What there is in place of positions tells what to change at the receiver."""
-    met = Counter(name_of(frame) for frame in frames(content, lambda: None))
-    if not met:
-        head = content[:_HEAD]
-        hint = next((hint for pattern, hint in _ALMOST.items() if re.search(pattern, head)), _OTHER)
-        return UnknownError(
-            "holds no message of a known receiver" if content else "is empty",
-            place=str(log),
-            expected="UBX, SBF, NMEA, NovAtel, JSON of gpsd, RTKLIB .pos, a bag, or CSV",
-            remedy=hint + _reasons(dropped),
-        )
-    return NoEpochError(
-        "no epoch with a time and a position",
-        place=str(log),
-        found=", ".join(f"{name} ({count})" for name, count in met.most_common(_MOST_NAMES)),
-        expected="UBX NAV-PVT, SBF PVTGeodetic or PVTCartesian, NMEA GGA, GNS or RMC with a date, "
-        "NovAtel BESTPOS or INSPVA",
-        remedy="Let the receiver record one of these messages, or give the day of NMEA without one by --date."
-        + _reasons(dropped),
-    )
-
-
-def _worth(protocol: Protocol, epochs: Epochs) -> int:
-    """A receiver that sends NMEA beside its own protocol rounds there, and leaves out how accurate it is."""
-    return epochs.positions * (1 if protocol is Protocol.NMEA else 2)
-
-
-def _decode(frame: Frame, gathered: Gathered) -> bool:
-    """Add what a message says to its epoch; whether it is of a kind that is used."""
-    parse, decode = _PROTOCOLS[frame.protocol]
-    try:
-        message = parse(frame.content)
-    except ImportError as error:
-        raise InputError(
-            f"cannot be read without the package {error.name}",
-            place=f"{frame.protocol} messages",
-            remedy=f"Install the extra `{'novatel' if frame.protocol is Protocol.NOVATEL else 'receivers'}`.",
-        ) from None
-    except Exception:
-        # The parsers' own errors share no base class.
-        gathered.drop(_UNFIT)
-        return True
-    try:
-        if message is not None:
-            decode(gathered, message, frame.content)
-    except (AttributeError, OverflowError):  # a message that ends before its fields do, a time beyond all calendars
-        gathered.drop(_UNFIT)
-    return message is not None
-
-
-# What is left out though it is almost a log, and what to do.
-_OTHER = "Convert it to CSV and give a mapping, if the receiver is another one."
-_ALMOST = {
-    rb"\A.{20,60}C?RINEX VER": "RINEX holds ranges, no positions: compute them first, "
-    "for example with rnx2rtkp of RTKLIB, and convert the .pos file that it writes.",
-    rb"\$[A-Z]{2}(GGA|GNS|RMC),[^*\r\n]*\r?\n": "NMEA without checksums cannot be checked: let the logger keep them.",
-}
-_MOST_NAMES = 20
-# Where a hint is looked for: what begins with gigabytes of something else is no such file.
-_HEAD = 1024 * 1024
-_UNCHECKED = "sentence without a checksum (nothing shows whether it is whole)"
-_UNFIT = "message that does not fit its definition"
-
-
-# By protocol: what makes a message of a frame, and what adds it to its epoch. The first wins a tie.
-_PROTOCOLS: dict[Protocol, tuple[Callable[[bytes], Any], Callable[[Gathered, Any, bytes], None]]] = {
-    Protocol.UBX: (ubx.parse, ubx.decode),
-    Protocol.SBF: (sbf.parse, sbf.decode),
-    Protocol.NOVATEL: (novatel.parse, novatel.decode),
-    Protocol.NMEA: (nmea.parse, nmea.decode),
-}

@@ -119,6 +119,7 @@ def _recorded(frame: pl.DataFrame, stream: Stream, has_fix: bool) -> pl.Series:
 def _mapped(
     table: pl.DataFrame, mapping: StreamMapping, stream: Stream, path: Path, left: Counter[str], config: IngestConfig
 ) -> pl.DataFrame:
+    """A table in the columns of a stream, by its mapping."""
     if not mapping.time.startswith("field:"):
         raise InputError("a CSV has no log time", place=str(path), expected='time = "field:COLUMN"')
     kinds = {name: _kind(dtype) for name, dtype in table.schema.items()}
@@ -143,12 +144,14 @@ def _mapped(
 
 
 def _kind(dtype: pl.DataType) -> str:
+    """Kind of the values of a column, in the words of mappings."""
     if dtype.is_integer():
         return "int"
     return "float" if dtype.is_float() else "flag" if dtype == pl.Boolean else "text"
 
 
 def _typed(recorded: pl.Series, source: Source, path: Path) -> pl.Series:
+    """Texts of a column in the type that its recipe names."""
     try:
         return recorded.cast(source.types[recorded.name])
     except pl.exceptions.PolarsError:
@@ -165,6 +168,6 @@ def _typed(recorded: pl.Series, source: Source, path: Path) -> pl.Series:
 
 
 def _not_nan(expression: pl.Expr, fields: pl.DataFrame) -> pl.Expr:
-    """In a text, NaN is how programs write that they have no value."""
+    """The values without NaN: in a text that is how programs write that they have no value."""
     is_float = fields.lazy().select(expression.alias("value")).collect_schema()["value"].is_float()
     return expression.fill_nan(None) if is_float else expression

@@ -82,6 +82,7 @@ def instants(table: pl.DataFrame, mapping: StreamMapping, path: Path) -> pl.Seri
 def _refuse(
     wrong: pl.Series, values: pl.Series, place: str, message: str, expected: str, remedy: str | None = None
 ) -> None:
+    """Refuse a column with values that are wrong, and show the first of them."""
     if wrong.any():
         row = int(wrong.arg_max() or 0)
         raise InputError(
@@ -171,7 +172,7 @@ def _from_zone(local_ns: pl.Series, local: pl.Series, zone: str, place: str) -> 
         )
         expected = "times that there are; clocks leave an hour out in spring"
         _refuse(never, civil, place, f"holds a time that clocks never show in {zone}", expected, remedy)
-    instants, unclear = _told_apart(local_ns, first, second, local & (first != second))
+    instants, unclear = _resolve_repeated_hours(local_ns, first, second, local & (first != second))
     if unclear.any():
         row = int(unclear.arg_max() or 0)
         zones = " or ".join(_fixed_zone(local_ns[row] - utc_ns[row]) for utc_ns in (first, second))
@@ -185,8 +186,8 @@ def _from_zone(local_ns: pl.Series, local: pl.Series, zone: str, place: str) -> 
 def _refuse_other_letters(utc_ns: pl.Series, letters: pl.Series, texts: pl.Series, zone: str, place: str) -> None:
     """Refuse letters behind times that are not those of the zone then: CET in summer is another hour than CEST."""
     then = utc_ns.cast(pl.Datetime("ns", "UTC")).dt.convert_time_zone(zone).dt.to_string("%Z")
-    told = letters.replace(_GERMAN_LETTERS)
-    wrong = told.is_not_null() & then.str.contains("^[A-Z]+$") & (told != then)
+    english = letters.replace(_GERMAN_LETTERS)
+    wrong = english.is_not_null() & then.str.contains("^[A-Z]+$") & (english != then)
     remedy = "Name the zone of these letters, or one of a fixed offset, such as Etc/GMT-1."
     _refuse(wrong, texts, place, f"holds times whose letters are not those of {zone}", "letters of this zone", remedy)
 
@@ -197,7 +198,7 @@ def _fixed_zone(ahead_ns: int) -> str:
     return f'"Etc/GMT{-hours:+d}"' if hours else '"UTC"'
 
 
-def _told_apart(
+def _resolve_repeated_hours(
     local_ns: pl.Series, first: pl.Series, second: pl.Series, twice: pl.Series
 ) -> tuple[pl.Series, pl.Series]:
     """The instants with each hour that is shown `twice` told apart by the order of its rows, and where it cannot be.
@@ -227,6 +228,7 @@ def _told_apart(
 
 
 def _offset_ns(zone: pl.Series) -> pl.Series:
+    """Offset of time zones from UTC [ns]."""
     digits = zone.str.replace_all("[A-Z:]", "").str.extract(r"([0-9]{4})").fill_null("0000")
     minutes = digits.str.slice(0, 2).cast(pl.Int64) * 60 + digits.str.slice(2, 2).cast(pl.Int64)
     sign = pl.Series(np.where(zone.str.starts_with("-").fill_null(False).to_numpy(), -1, 1))

@@ -40,4 +40,5 @@ def east_north_up(latitude_deg: Any, longitude_deg: Any) -> Floats:
 
 @cache
 def _transformer() -> Transformer:
+    """The transformation from earth-fixed coordinates to geodetic ones."""
     return Transformer.from_crs("EPSG:4978", "EPSG:4979", always_xy=True)

@@ -23,7 +23,7 @@ from schemas.run import Stream
 # one another epoch of the same key begins. Numerics of the reading, which has no configuration.
 _LATEST_MESSAGE = 32
 # Epochs of one key so near to each other are of two receivers, or of stamps that are coarser than the rate.
-_BESIDE = 4
+_EPOCHS_APART = 4
 
 
 @dataclass
@@ -76,7 +76,7 @@ class Gathered:
             earlier = epoch
             epoch = self._latest[key] = Epoch(key, len(self.epochs))
             self.epochs.append(epoch)
-            if earlier is not None and epoch.number - earlier.number <= _BESIDE:
+            if earlier is not None and epoch.number - earlier.number <= _EPOCHS_APART:
                 self.twins.append((earlier, epoch))
         if position:
             epoch.positions[position] = content
@@ -93,6 +93,7 @@ class Gathered:
         return 0.0
 
     def drop(self, reason: str, count: int = 1) -> None:
+        """Count records that are left out for a reason."""
         if count:
             self.dropped[reason] = self.dropped.get(reason, 0) + count
 

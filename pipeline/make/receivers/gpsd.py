@@ -46,16 +46,16 @@ def read_gpsd(
     """Streams, and what could not be used. `solution`: the device that is meant, where the log holds several."""
     gathered = Gathered()
     devices: Counter[str] = Counter()
-    seen = list(_objects(content, gathered))
-    for seen_object in seen:
-        if seen_object["class"] == "TPV" and _has_fix(seen_object):
-            devices[_device(seen_object)] += 1
+    reports = list(_objects(content, gathered))
+    for report in reports:
+        if report["class"] == "TPV" and _has_fix(report):
+            devices[_device(report)] += 1
     chosen = next((name for name in devices if solution in (name, name.rsplit("/", 1)[-1])), None)
     if len(devices) > 1 and chosen is None:
-        raise two_receivers(str(log), frozenset(devices), _apart_m(seen), "device")
-    for seen_object in seen:
-        if len(devices) < 2 or _device(seen_object) == chosen:
-            _DECODERS[seen_object["class"]](gathered, seen_object)
+        raise two_receivers(str(log), frozenset(devices), _apart_m(reports), "device")
+    for report in reports:
+        if len(devices) < 2 or _device(report) == chosen:
+            _DECODERS[report["class"]](gathered, report)
     if (apart_m := sees_twins(gathered)) is not None:
         raise two_receivers(str(log), frozenset(), apart_m)
     epochs = gathered.settled()
@@ -87,10 +87,12 @@ def _objects(content: bytes, gathered: Gathered) -> Iterator[dict[str, Any]]:
 
 
 def _device(found: dict[str, Any]) -> str:
+    """Name of the receiver that a report is of."""
     return str(found.get("device", ""))
 
 
 def _has_fix(found: dict[str, Any]) -> bool:
+    """Whether a report has a position."""
     return _number(found, "mode", 0.0) >= 2 and _number(found, "lat") is not None and _number(found, "lon") is not None
 
 
@@ -101,11 +103,11 @@ def _number(found: dict[str, Any], name: str, other: Any = None) -> Any:
     return float(value) if known and isinstance(value, int | float) else other
 
 
-def _apart_m(seen: list[dict[str, Any]]) -> float:
+def _apart_m(reports: list[dict[str, Any]]) -> float:
     """How far apart devices tell to be at one time [m]; 0 where they never tell of the same."""
     places: dict[int, tuple[str, tuple[float, float]]] = {}
     widest_m = 0.0
-    for found in seen:
+    for found in reports:
         t_ns = _time_ns(found)
         if t_ns is None or found["class"] != "TPV" or not _has_fix(found):
             continue
@@ -135,6 +137,7 @@ def _time_ns(found: dict[str, Any]) -> int | None:
 
 
 def _position(gathered: Gathered, found: dict[str, Any]) -> None:
+    """Put down the position of a report."""
     t_ns = _time_ns(found)
     if t_ns is None:
         gathered.drop("time not valid")
@@ -153,13 +156,14 @@ def _position(gathered: Gathered, found: dict[str, Any]) -> None:
 
 
 def _kind(found: dict[str, Any]) -> Fix:
+    """Kind of fix of a report."""
     if not _has_fix(found):
         return Fix.NONE
     return _STATUS.get(int(_number(found, "status", 0.0)), Fix.AUTONOMOUS)
 
 
 def _height_m(found: dict[str, Any]) -> float | None:
-    """Over the ellipsoid; `alt` of old logs is over the geoid or the ellipsoid, which nobody says."""
+    """Height over the ellipsoid [m]; `alt` of old logs is over the geoid or the ellipsoid, which nobody says."""
     if _number(found, "mode", 0.0) < 3:
         return None
     if (height_m := _number(found, "altHAE")) is not None:
@@ -169,7 +173,7 @@ def _height_m(found: dict[str, Any]) -> float | None:
 
 
 def _velocity(found: dict[str, Any]) -> dict[str, float]:
-    """By axes where they are told, else by speed [m/s] and course [deg from true north]."""
+    """Velocity by axes where reported, else by speed [m/s] and course [deg from true north]."""
     axes = [_number(found, name) for name in ("velE", "velN", "velD")]
     if None not in axes:
         return velocity(axes[0], axes[1], -axes[2])
@@ -196,6 +200,7 @@ def _sky(gathered: Gathered, found: dict[str, Any]) -> None:
 
 
 def _satellite(entry: dict[str, Any]) -> dict[str, Any] | None:
+    """One satellite of a report, if it is complete."""
     name = _name(entry)
     azimuth_deg, elevation_deg = _number(entry, "az"), _number(entry, "el")
     if name is None or azimuth_deg is None or elevation_deg is None or not abs(elevation_deg) <= 90.0:
@@ -211,6 +216,7 @@ def _satellite(entry: dict[str, Any]) -> dict[str, Any] | None:
 
 
 def _name(entry: dict[str, Any]) -> str | None:
+    """Name of a satellite, by its system or its PRN."""
     system, number, prn = (_number(entry, name) for name in ("gnssid", "svid", "PRN"))
     if system is not None and number is not None and int(system) in _SYSTEMS and 0 < number < 256:
         return satellite_name(_SYSTEMS[int(system)], int(number))

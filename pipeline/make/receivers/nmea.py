@@ -76,15 +76,17 @@ class Sentences(Gathered):
 
     @property
     def rivals(self) -> frozenset[str]:
+        """Talkers of which each has positions of its own at the same times."""
         return self.talkers.rivals
 
     @property
     def widest_m(self) -> float:
+        """How far apart two talkers are at most [m]."""
         return self.talkers.widest_m
 
 
 def _datum(m: Any) -> str:
-    """Of DTM: its code, where positions are not those of WGS 84."""
+    """Code of the datum by DTM, where positions are not those of WGS 84."""
     code = str(m.datum).strip().upper()
     shifted = any(isinstance(value, float | int) and value for value in (m.latOfset, m.lonOfset))
     return "" if code in ("", "W84") and not shifted else code or "999"
@@ -112,6 +114,7 @@ def _belongs(gathered: Sentences, m: Any, raw: bytes) -> bool:
 
 
 def _has_fix(m: Any) -> bool:
+    """Whether a sentence has a position."""
     if m.msgID == "RMC":
         return bool(m.status == "A")
     kind = _FIXES.get(int(m.quality or 0), Fix.NONE) if m.msgID == "GGA" else None
@@ -142,14 +145,14 @@ def settle_days(gathered: Gathered, first_day: date | None = None) -> None:
     gathered.drop("time without a date", len(early))
     dropped = {epoch.number for epoch in early}
     gathered.epochs = [epoch for epoch in epochs if epoch.number not in dropped]
-    for way in (1, -1):
-        for known, epoch in pairwise(gathered.epochs[::way]):
+    for sense in (1, -1):
+        for known, epoch in pairwise(gathered.epochs[::sense]):
             if epoch.t_ns is None and known.t_ns is not None:
-                epoch.t_ns = _time_next_to(known.t_ns, epoch.key, way)
+                epoch.t_ns = _time_next_to(known.t_ns, epoch.key, sense)
 
 
 def _turned_dates(epochs: list[Epoch]) -> int:
-    """Put dates that turn beside midnight on the day of their neighbours; how many.
+    """Put dates that turn near midnight on the day of their neighbours; how many.
 
     Seen by time that goes back by a day within one step: so does no clock. The dates are wrong until time goes on by a
     day within one step, or from such a step before on.
@@ -170,10 +173,10 @@ def _turned_dates(epochs: list[Epoch]) -> int:
     return turned
 
 
-def _time_next_to(known_ns: int, moment: time, way: int) -> int:
+def _time_next_to(known_ns: int, moment: time, sense: int) -> int:
     """The time of an epoch after (1) or before (-1) one whose time is known: of the same day, or past midnight."""
     t_ns = known_ns - known_ns % _DAY_NS + _time_ns(date(1970, 1, 1), moment)
-    return t_ns + way * _DAY_NS if way * (known_ns - t_ns) > _DAY_NS // 2 else t_ns
+    return t_ns + sense * _DAY_NS if sense * (known_ns - t_ns) > _DAY_NS // 2 else t_ns
 
 
 def _time_ns(day: date, moment: time) -> int:
@@ -183,6 +186,7 @@ def _time_ns(day: date, moment: time) -> int:
 
 
 def _date_of(m: Any) -> date | None:
+    """Date of a sentence, if it is one."""
     try:
         return date(int(m.year), int(m.month), int(m.day))
     except ValueError:
@@ -228,6 +232,7 @@ def _motion(epoch: Epoch, m: Any) -> None:
 
 
 def _accuracy(epoch: Epoch, m: Any) -> None:
+    """Covariance of a position from its standard deviations."""
     if all(isinstance(value, float) for value in (m.stdLat, m.stdLong, m.stdAlt)):
         epoch.gnss |= {"cov_ee_m2": m.stdLong**2, "cov_nn_m2": m.stdLat**2, "cov_uu_m2": m.stdAlt**2}
         epoch.gnss |= _correlation(m) | {"cov_eu_m2": 0.0, "cov_nu_m2": 0.0}

@@ -34,12 +34,14 @@ def parse(raw: bytes) -> Any:
 
 @cache
 def _decoder() -> Any:
+    """The decoder of NovAtel's logs."""
     from novatel_edie import oem
 
     return oem.Decoder()
 
 
 def _name(raw: bytes) -> str:
+    """Name of a message, of ASCII or binary form."""
     if raw[:1] in (b"#", b"%"):
         return raw[1:].split(b",")[0].decode().removesuffix("A")
     return NOVATEL_NAMES.get(struct.unpack_from("<H", raw, 4)[0], "")
@@ -82,8 +84,8 @@ def settle_source(gathered: Gathered) -> None:
     best = max(names, key=lambda name: _RANKS[name], default=None)
     if best is None:
         return
-    others_beside = [epoch for epoch in gathered.epochs if epoch.positions and best not in epoch.positions]
-    gathered.drop(f"NovAtel position beside those of {best}", len(others_beside))
+    others = [epoch for epoch in gathered.epochs if epoch.positions and best not in epoch.positions]
+    gathered.drop(f"NovAtel position beside those of {best}", len(others))
     gathered.epochs = [epoch for epoch in gathered.epochs if best in epoch.positions]
     _give(velocities, gathered.epochs)
 

@@ -92,7 +92,7 @@ def sees_twins(gathered: Gathered) -> float | None:
 
 
 def _detours(gathered: Gathered) -> Iterator[tuple[float, float, float]]:
-    """Of each pair of one time: how far apart, and the way over the second to the next, less the straight one [m]."""
+    """Distance of each pair of one time, and how far the path over the second is longer than the straight one [m]."""
     for one, two in gathered.twins:
         first, second = _place(one), _place(two)
         later = gathered.epochs[two.number + 1 : two.number + 4]
@@ -104,18 +104,19 @@ def _detours(gathered: Gathered) -> Iterator[tuple[float, float, float]]:
 
 
 def _place(epoch: Epoch) -> tuple[float, float] | None:
+    """Position of an epoch, if it has one."""
     latitude, longitude = epoch.gnss.get("latitude_deg"), epoch.gnss.get("longitude_deg")
     return None if latitude is None or longitude is None else (float(latitude), float(longitude))
 
 
 def two_receivers(place: str, names: frozenset[str], apart_m: float, option: str = "talker") -> InputError:
-    """What to do about a log of two receivers; `names`: those by which they can be told apart."""
-    told = " and ".join(sorted(names))
+    """What to do about a log of two receivers; `names`: those that distinguish them."""
+    talkers = " and ".join(sorted(names))
     choose = ", ".join(f"--solution {name}" for name in sorted(names))
     return InputError(
         "holds the positions of two receivers",
         place=place,
-        found=(f"{told}, " if names else "messages of one kind and time, ") + f"up to {apart_m:.1f} m apart",
+        found=(f"{talkers}, " if names else "messages of one kind and time, ") + f"up to {apart_m:.1f} m apart",
         expected="one receiver, or the one that is meant",
         remedy=f"Convert one {option} at a time, each as its own solution: {choose}."
         if names

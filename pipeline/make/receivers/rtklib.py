@@ -104,6 +104,7 @@ _USES = {
 
 
 def _layout(comments: list[str], path: Path) -> _RtklibHeader:
+    """Columns of a file of RTKLIB, of the line that names them."""
     headers = [re.split(r"[\s,;]+", line.lstrip("% ").strip()) for line in comments]
     headers = [words for words in headers if words[0] in _AHEAD_NS and {"Q", "ns"} <= set(words)]
     if not headers:
@@ -202,6 +203,7 @@ def _place(numbers: dict[str, Floats], layout: _RtklibHeader, path: Path) -> dic
 
 
 def _velocity(numbers: dict[str, Floats], place: dict[str, Floats]) -> dict[str, Any]:
+    """Velocities to the east, the north and up, however the file states them."""
     if "vx" in numbers:
         turn = east_north_up(place["latitude_deg"], place["longitude_deg"])
         local = np.einsum("ijn,jn->in", turn, np.array([numbers["vx"], numbers["vy"], numbers["vz"]]))
@@ -231,6 +233,7 @@ def _covariance(numbers: dict[str, Floats], layout: _RtklibHeader, path: Path) -
 
 
 def _quality(numbers: dict[str, Floats], path: Path) -> dict[str, Any]:
+    """Kind of fix by RTKLIB's quality."""
     strange = [code for code in np.unique(numbers["Q"]) if code not in _QUALITY]
     if strange:
         raise InputError(

@@ -70,12 +70,14 @@ def _solution(epoch: Epoch, m: Any) -> bool:
 
 
 def _geodetic(epoch: Epoch, m: Any) -> None:
+    """Position and velocity of a PVTGeodetic block."""
     if _solution(epoch, m) and m.Latitude != _DO_NOT_USE:
         place = {"latitude_deg": float(np.degrees(m.Latitude)), "longitude_deg": float(np.degrees(m.Longitude))}
         epoch.gnss |= place | _known({"height_m": m.Height, "vel_e_mps": m.Ve, "vel_n_mps": m.Vn, "vel_u_mps": m.Vu})
 
 
 def _cartesian(epoch: Epoch, m: Any) -> None:
+    """Position and velocity of a PVTCartesian block."""
     if not _solution(epoch, m) or m.X == _DO_NOT_USE:
         return
     place = geodetic(m.X, m.Y, m.Z)
@@ -85,6 +87,7 @@ def _cartesian(epoch: Epoch, m: Any) -> None:
 
 
 def _geodetic_covariance(epoch: Epoch, m: Any) -> None:
+    """Covariance of a PosCovGeodetic block."""
     epoch.gnss |= _known(covariance(m.Cov_lonlon, m.Cov_latlon, m.Cov_lonhgt, m.Cov_latlat, m.Cov_lathgt, m.Cov_hgthgt))
 
 
@@ -103,6 +106,7 @@ def _cartesian_covariance(epoch: Epoch, m: Any) -> None:
 
 
 def _protection(epoch: Epoch, m: Any) -> None:
+    """Put down the protection levels of a block."""
     epoch.gnss |= _known({"hpl_m": m.HPL, "vpl_m": m.VPL})
 
 

@@ -92,6 +92,7 @@ def _time_ns(m: Any) -> int | None:
 
 
 def _fix(m: Any) -> Columns:
+    """Kind of fix, and number of satellites used."""
     return {"fix": _kind(m).value, "satellites": m.numSV}
 
 
@@ -124,6 +125,7 @@ def _accuracy(m: Any) -> Columns:
 
 
 def _stated_covariance(m: Any) -> Columns:
+    """Covariance of a position, if the receiver states one."""
     values = (m.posCovEE, m.posCovNE, -m.posCovED, m.posCovNN, -m.posCovND, m.posCovDD)
     return covariance(*values) if m.posCovValid else {}
 
@@ -134,7 +136,7 @@ def _protection(m: Any) -> Columns:
 
 
 def _satellites(m: Any, count: int, residual_m: float) -> list[Columns]:
-    """Those that are known and above or below a horizon [deg]; `residual_m`: the unit of the residual."""
+    """Satellites known and above or below a horizon [deg]; `residual_m`: the unit of the residual."""
     rows: list[Columns] = []
     for index in range(1, count + 1):
         azimuth, elevation, residual, used = (

@@ -43,6 +43,7 @@ def unpacked(log: Path, config: IngestConfig) -> Iterator[list[Path]]:
 
 
 def _all_logs(log: Path, place: Path, budget: Budget) -> list[Path]:
+    """All logs within an archive, archives within it included."""
     try:
         _unpack(log, place, budget)
         return [inner for entry in sorted(place.iterdir()) for inner in _logs(entry, _DEEPEST, budget)]
@@ -56,14 +57,17 @@ def _all_logs(log: Path, place: Path, budget: Budget) -> list[Path]:
 
 
 def is_packed(path: Path) -> bool:
+    """Whether a file is an archive, by its suffix."""
     return path.suffix.lower() in _UNPACKERS
 
 
 def _unpack(archive: Path, place: Path, budget: Budget) -> None:
+    """Unpack an archive by its suffix."""
     _UNPACKERS[archive.suffix.lower()](archive, place, budget)
 
 
 def _unpack_zip(archive: Path, place: Path, budget: Budget) -> None:
+    """Unpack a zip archive, within the budget."""
     with zipfile.ZipFile(archive) as opened:
         for entry in opened.infolist():
             if not entry.is_dir():
@@ -72,6 +76,7 @@ def _unpack_zip(archive: Path, place: Path, budget: Budget) -> None:
 
 
 def _unpack_tar(archive: Path, place: Path, budget: Budget) -> None:
+    """Unpack a tar archive, within the budget."""
     with tarfile.open(archive, "r:") as opened:
         for entry in opened:
             packed = opened.extractfile(entry) if entry.isreg() else None
@@ -82,7 +87,7 @@ def _unpack_tar(archive: Path, place: Path, budget: Budget) -> None:
 
 
 def _unpack_one(opener: Callable[[Path], Any]) -> Callable[[Path, Path, Budget], None]:
-    """Of a format that packs a single file, which is called as the archive without its last suffix."""
+    """Unpack a format of one single file, which is called as the archive without its last suffix."""
 
     def unpack(archive: Path, place: Path, budget: Budget) -> None:
         name = archive.stem + (".tar" if archive.suffix.lower() == ".tgz" else "")

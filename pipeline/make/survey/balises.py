@@ -26,9 +26,9 @@ from schemas.inputs import Balises
 
 
 def balises_every(network: SurveyNetwork, spacing_m: float, travel: TravelAlong) -> pl.DataFrame:
-    """Virtual balises at whole multiples of the spacing, counted along the shortest way from the survey's start.
+    """Virtual balises at whole multiples of the spacing, counted along the shortest route from the survey's start.
 
-    So the spacing holds over joints and switches; where two ways meet again it begins anew. `travel`: for trains away
+    So the spacing holds over joints and switches; where two routes meet again it begins anew. `travel`: for trains away
     from the survey's start, back to it, or both.
     """
     track = track_of(network.track)
@@ -38,9 +38,11 @@ def balises_every(network: SurveyNetwork, spacing_m: float, travel: TravelAlong)
         at_start, at_end = from_start[network.ends[element]]
         length = float(track.length_m[element])
         begins = min(at_start, at_end)
-        way = np.arange(np.floor(begins / spacing_m) + 1, np.floor((begins + length) / spacing_m) + 1) * spacing_m
+        chainage_m = (
+            np.arange(np.floor(begins / spacing_m) + 1, np.floor((begins + length) / spacing_m) + 1) * spacing_m
+        )
         away = bool(at_start <= at_end)
-        measures = way - begins if away else length - (way - begins)
+        measures = chainage_m - begins if away else length - (chainage_m - begins)
         side = {"netelement_id": name, "direction": _direction(away, travel).value}
         rows += [{**side, "measure_m": float(measure)} for measure in np.clip(measures, 0.0, length)]
     ids = [f"VB{number:0{len(str(len(rows)))}}" for number in range(1, len(rows) + 1)]
@@ -56,6 +58,7 @@ def _direction(away: bool, travel: TravelAlong) -> BaliseDirection:
 
 
 def _typed(place: str, table: pl.DataFrame) -> pl.DataFrame:
+    """A list of balises in the types of a site."""
     breaches: list[str] = []
     typed = typed_table(RawTable(place, table), "balises", breaches)
     if typed is None:
@@ -132,6 +135,7 @@ class _Placer:
         self.everywhere = segments_of(track).search()
 
     def placed(self, row: dict[str, Any]) -> tuple[str, float]:
+        """Net element and measure [m] of a row: as given, by coordinates, or by line kilometre."""
         filled = {key for key, value in row.items() if value is not None}
         if {"netelement_id", "measure_m"} <= filled:
             return str(row["netelement_id"]), float(row["measure_m"])
@@ -143,9 +147,11 @@ class _Placer:
         raise self._refusal(row, "has no place", expected=expected)
 
     def _refusal(self, row: dict[str, Any], message: str, **details: str) -> SiteError:
+        """The error for a balise."""
         return SiteError(message, place=f"{self.place}: balise {row['balise_id']}", **details)
 
     def _at_coordinates(self, row: dict[str, Any]) -> tuple[str, float]:
+        """Net element and measure of a balise given by coordinates."""
         point = points_of(np.array([row["latitude_deg"]]), np.array([row["longitude_deg"]]))
         far_m = self.config.balise_beside_m
         near = candidates_of(point, self.ground, self.everywhere, 2 * far_m)
@@ -160,6 +166,7 @@ class _Placer:
         return self.track.ids[ranked[0][1]], ranked[0][2]
 
     def _report_rival(self, row: dict[str, Any], ranked: list[tuple[float, int, float]]) -> None:
+        """Report tracks on which a balise may lie as well."""
         near = [candidate for candidate in ranked[1:] if candidate[0] < ranked[0][0] + self.config.same_track_m]
         nodes = set(self.network.ends[ranked[0][1]].tolist())
         for _, rival, _ in near:
@@ -168,6 +175,7 @@ class _Placer:
                 self.survey.report("warning", f"balises: {row['balise_id']}", text, "Name netelement_id in the list.")
 
     def _at_kilometre(self, row: dict[str, Any]) -> tuple[str, float]:
+        """Net element and measure of a balise given by its kilometre."""
         wanted = row.get("netelement_id")
         km = float(row["line_km"])
         hits = [

@@ -1,4 +1,4 @@
-"""What is doubtful about a network made of a survey, beside what every site is checked for."""
+"""What is doubtful about a network made of a survey, besides what every site is checked for."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import numpy as np
 from pipeline.make.survey.network import SurveyNetwork
 from pipeline.make.survey.pieces import LinePiece, kilometre_spans
 from pipeline.stages.paths.candidates import candidates_of, segments_of
-from pipeline.stages.track.geodesy import points_of, way_m
+from pipeline.stages.track.geodesy import distance_along_m, points_of
 from pipeline.stages.track.network import Network, network_of
 from pipeline.stages.track.segments import SAMPLE_SPACING_M
 from pipeline.stages.track.survey import in_pieces, places_along, track_of
@@ -18,7 +18,7 @@ from schemas.run import Finding
 
 
 def doubts(network: SurveyNetwork, config: SurveyConfig, site: SiteConfig) -> list[Finding]:
-    """Kinks, tracks that were surveyed twice, open ends beside other track, heights and kilometres that do not fit."""
+    """Kinks, tracks that were surveyed twice, open ends next to other track, heights and kilometres that do not fit."""
     track = track_of(network.track)
     in_parts = network_of(in_pieces(track), network.links)
     findings = [*_heights(network.elements), *_doubled(in_parts, config)]
@@ -29,6 +29,7 @@ def doubts(network: SurveyNetwork, config: SurveyConfig, site: SiteConfig) -> li
 
 
 def _heights(elements: list[LinePiece]) -> Iterator[Finding]:
+    """Points without height."""
     flat = [np.isnan(element.height_m).all() for element in elements]
     if all(flat):
         text = "no point has a height: the site is 2-D, and nothing is diagnosed in height"
@@ -44,6 +45,7 @@ def _heights(elements: list[LinePiece]) -> Iterator[Finding]:
 
 
 def _kinks(element: LinePiece, config: SurveyConfig) -> Iterator[Finding]:
+    """Kinks sharper than track can be."""
     steps = np.diff(element.surface, axis=0)
     length = np.linalg.norm(steps, axis=1)
     unit = steps / length[:, None]
@@ -61,15 +63,16 @@ def _kinks(element: LinePiece, config: SurveyConfig) -> Iterator[Finding]:
 
 
 def _kilometres(element: LinePiece, config: SurveyConfig) -> Iterator[Finding]:
-    way = way_m(element.surface)
-    known, off_m, jumps = kilometre_spans(element.line_km, way, config)
+    """Jumps of the kilometres against the length of the track."""
+    distance_m = distance_along_m(element.surface)
+    known, off_m, jumps = kilometre_spans(element.line_km, distance_m, config)
     if jumps.any():
         row = int(np.argmax(np.where(jumps, off_m, 0.0)))
         first = known[row]
         last = known[row + 1]
         text = (
             f"line kilometre goes from {element.line_km[first]:.3f} to {element.line_km[last]:.3f} "
-            f"over {way[last] - way[first]:.0f} m of track ({jumps.sum()} such places)"
+            f"over {distance_m[last] - distance_m[first]:.0f} m of track ({jumps.sum()} such places)"
         )
         yield Finding("warning", f"track: {element.name}", text, "A jump of the kilometres, or points out of order.")
 
@@ -95,7 +98,7 @@ def _doubled(ground: Network, config: SurveyConfig) -> Iterator[Finding]:
 
 
 def _open_ends(ground: Network, same_track_m: float, near_ends_m: float) -> Iterator[Finding]:
-    """Ends that lie beside the middle of another element: a switch without its node. Ends near ends: `site.checks`."""
+    """Ends that lie next to the middle of another element: a switch without its node. Ends near ends: `site.checks`."""
     track = ground.track
     element, position = np.nonzero(~ground.linked_ends())
     row = np.where(position == 0, track.first[element], track.first[element + 1] - 1)
@@ -106,7 +109,7 @@ def _open_ends(ground: Network, same_track_m: float, near_ends_m: float) -> Iter
     for near in np.flatnonzero(middle & (candidates.element != element[candidates.step])).tolist():
         end = int(candidates.step[near])
         neighbour = track.ids[int(candidates.element[near])]
-        beside = f"{candidates.distance_m[near]:.1f} m from the middle of {neighbour}"
-        text = f"end {position[end]} lies {beside} and is not joined to it"
+        found = f"{candidates.distance_m[near]:.1f} m from the middle of {neighbour}"
+        text = f"end {position[end]} lies {found} and is not joined to it"
         remedy = "Give both lines a point in common there, if it is a switch."
         yield Finding("warning", f"track: {track.ids[int(element[end])]}", text, remedy)

@@ -33,7 +33,7 @@ Feature = tuple[dict[str, Any], Mapping[str, Any]]
 
 
 def read_geojson(place: str, stem: str, data: bytes, config: SiteConfig, id_field: str | None = None) -> Survey:
-    """Each LineString a piece, named by its own id. Where features have a `railway`, only those in use are taken.
+    """Read each LineString as a piece named by its own id; of features with `railway` only those in use.
 
     A network that gives net relations (RailTopoModel, ERA RINF) is taken as it is, Overpass JSON like GeoJSON.
     `id_field`: property that names the lines. Raises `SiteError`.
@@ -123,6 +123,7 @@ def _of_network(place: str, data: bytes, config: SiteConfig) -> Survey:
 
 
 def _require_field(place: str, features: list[Feature], id_field: str | None) -> None:
+    """Refuse an attribute for names that no feature has."""
     if id_field is None or any(id_field in tags for tags, _ in features):
         return
     known = sorted({key for tags, _ in features for key in tags})
@@ -145,6 +146,7 @@ def _feature(item: Any) -> Feature:
 
 
 def _lines(geometry: Mapping[str, Any]) -> Iterator[Any]:
+    """Lines of a geometry."""
     coordinates = geometry.get("coordinates")
     if geometry.get("type") == "LineString":
         yield coordinates
@@ -153,6 +155,7 @@ def _lines(geometry: Mapping[str, Any]) -> Iterator[Any]:
 
 
 def _piece(place: str, name: str, line: Any) -> Any:
+    """A piece of track from the coordinates of a line."""
     if not isinstance(line, list):
         raise SiteError("coordinates are no list", place=place)
     triples = [_numbers(place, point) for point in line]
@@ -161,6 +164,7 @@ def _piece(place: str, name: str, line: Any) -> Any:
 
 
 def _numbers(place: str, point: Any) -> tuple[float, float, float | None]:
+    """Longitude, latitude and height of a point."""
     try:
         return triple(point)
     except ValueError:

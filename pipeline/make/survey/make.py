@@ -116,6 +116,7 @@ def make_site(wish: Wish, vehicle: Vehicle, config: Configuration) -> Site:
 
 
 def _balises(wish: Wish, network: SurveyNetwork, survey: Survey, config: Configuration) -> pl.DataFrame | None:
+    """Balises at a spacing or from a list, whichever is wished."""
     if wish.spacing_m is not None:
         table = balises_every(network, wish.spacing_m, wish.travel)
         return table if table.height else None
@@ -135,8 +136,8 @@ def write_made(site: Site, page: str, out: Path, force: bool) -> None:
         if table is not None
     }
     findings = pl.DataFrame([asdict(one) for one in site.findings], schema=list(Finding.__dataclass_fields__))
-    beside = {"findings.csv": findings.write_csv().encode(), "site.html": page.encode()}
-    replace_files(out, {**contents, **written, **beside}, marker="track.parquet")
+    companions = {"findings.csv": findings.write_csv().encode(), "site.html": page.encode()}
+    replace_files(out, {**contents, **written, **companions}, marker="track.parquet")
 
 
 def _number(text: str) -> float | None:

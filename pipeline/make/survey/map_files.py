@@ -31,7 +31,7 @@ _POINT, _LINE_STRING, _MULTI_LINE_STRING = 1, 2, 5
 
 
 def read_map(path: Path, data: bytes, config: SurveyConfig, id_field: str | None = None) -> Survey:
-    """Each line of each layer a piece, in WGS 84, named by `id_field` if given. Raises `SiteError`."""
+    """Read each line of each layer as a piece in WGS 84, named by `id_field` if given. Raises `SiteError`."""
     try:
         import pyogrio
     except ImportError:
@@ -68,14 +68,15 @@ def _copied(path: Path, data: bytes, config: SurveyConfig) -> Iterator[_Copy]:
         file.write_bytes(data)
         size_bytes = len(data)
         for ending in _COMPANIONS[file.suffix]:
-            beside = [_companion(path, one) for one in (ending, ending.upper())]
-            found = [one for one in beside if exists(one)]
+            companions = [_companion(path, one) for one in (ending, ending.upper())]
+            found = [one for one in companions if exists(one)]
             if found:
                 size_bytes += _companion(file, ending).write_bytes(content_of_survey(found[0], config))
         yield _Copy(file, size_bytes)
 
 
 def _companion(path: Path, ending: str) -> Path:
+    """Another file of the same map, by its ending."""
     return path.with_suffix(ending) if ending.startswith(".") else path.with_name(path.name + ending)
 
 
@@ -105,6 +106,7 @@ def _features(path: Path, layer: str) -> Iterator[Feature]:
 
 
 def _plain(value: Any) -> Any:
+    """A value without its type of numpy."""
     return value.item() if isinstance(value, np.generic) else value
 
 

@@ -69,6 +69,7 @@ def make_network(survey: Survey, join_m: float | None, config: SurveyConfig) -> 
 def _linked(
     elements: list[LinePiece], ends: Ints, crossings: set[int], switches: set[int], survey: Survey, config: SurveyConfig
 ) -> SurveyNetwork:
+    """A network with its links between net elements."""
     track = _track_table(elements)
     return SurveyNetwork(elements, ends, _links(track, ends, crossings, switches, survey, config), track)
 
@@ -95,8 +96,8 @@ def _nodes(pieces: list[LinePiece], join_m: float, relations: list[Relation]) ->
     end_row |= {(piece.name, 0): int(row) - len(piece) for piece, row in zip(pieces, last, strict=True)}
     pairs += [
         (end_row[a, a_end], end_row[b, b_end])
-        for a, a_end, b, b_end, way in relations
-        if way != Navigability.NONE.value and (a, a_end) in end_row and (b, b_end) in end_row
+        for a, a_end, b, b_end, navigability in relations
+        if navigability != Navigability.NONE.value and (a, a_end) in end_row and (b, b_end) in end_row
     ]
     rows, columns = np.array(pairs, dtype=np.int64).reshape(-1, 2).T
     count = int(node.max()) + 1
@@ -106,19 +107,19 @@ def _nodes(pieces: list[LinePiece], join_m: float, relations: list[Relation]) ->
 
 
 def _near_ends(surface: Floats, piece_of: Ints, ends: Ints, join_m: float) -> Iterator[tuple[int, int]]:
-    """Each end with the nearest vertex of another piece within reach, or with an end of its own (a ring)."""
+    """The nearest vertex of another piece within reach of each end, or an end of its own (a ring)."""
     tree = cKDTree(surface)
     at_end = np.zeros(len(surface), dtype=bool)
     at_end[ends] = True
     for end, near in zip(ends, tree.query_ball_point(surface[ends], join_m), strict=True):
         others = [row for row in near if row != end and (piece_of[row] != piece_of[end] or at_end[row])]
         if others:
-            way = np.linalg.norm(surface[others] - surface[end], axis=1)
-            yield int(end), others[int(np.argmin(way))]
+            apart_m = np.linalg.norm(surface[others] - surface[end], axis=1)
+            yield int(end), others[int(np.argmin(apart_m))]
 
 
 def _without_doubles(pieces: list[LinePiece], nodes: list[Ints], survey: Survey) -> tuple[list[LinePiece], list[Ints]]:
-    """Each stretch between two nodes once: the first line that has it keeps it."""
+    """Pieces with each stretch between two nodes once: the first line that has it keeps it."""
     seen: set[tuple[int, int]] = set()
     kept = []
     kept_nodes = []
@@ -210,7 +211,7 @@ def _links(
 ) -> pl.DataFrame:
     """The relations given, as they are; of ends that none of them names every pair at a node, by its angle.
 
-    By angle a pair is navigable in both directions where a train can go that way, else not at all.
+    By angle a pair is navigable in both directions where a train can take that branch, else not at all.
     """
     track = track_of(table)
     relations = survey.relations
@@ -227,9 +228,9 @@ def _links(
         units = [directions[arm] / max(float(np.linalg.norm(directions[arm])), 1e-9) for arm in meeting]
         pairs = _navigable(units, node in crossings, node in switches, config.switch_deg)
         for pair in unsaid:
-            way = Navigability.BOTH if pair in pairs else Navigability.NONE
+            navigability = Navigability.BOTH if pair in pairs else Navigability.NONE
             first, second = (here[k] for k in pair)
-            rows.append((*first, *second, way.value))
+            rows.append((*first, *second, navigability.value))
         guessed += [here] * bool(unsaid)
         if node not in crossings | switches:
             _report_node([name for name, _ in here], pairs, survey)
@@ -263,8 +264,8 @@ def _navigable(units: list[Floats], crossing: bool, switch: bool, switch_deg: fl
     # tram curve of 20 m.
     most = 90.0 if len(units) == 2 else switch_deg
     possible = {pair for pair, turn in turns.items() if turn <= most}
-    ways = [sum(arm in pair for pair in possible) for arm in range(len(units))]
-    two_by_two = ways == [2, 2, 2, 2]
+    partners = [sum(arm in pair for pair in possible) for arm in range(len(units))]
+    two_by_two = partners == [2, 2, 2, 2]
     if not (crossing or (two_by_two and not switch)):
         return possible
     straight: set[tuple[int, int]] = set()
@@ -275,6 +276,7 @@ def _navigable(units: list[Floats], crossing: bool, switch: bool, switch_deg: fl
 
 
 def _report_node(names: list[str], pairs: set[tuple[int, int]], survey: Survey) -> None:
+    """Report net elements at a node from which no train gets on."""
     place = f"links: {', '.join(names)}"
     lonely = [name for arm, name in enumerate(names) if len(names) > 1 and not any(arm in pair for pair in pairs)]
     if lonely:

@@ -109,6 +109,7 @@ class Survey:
     findings: list[Finding] = field(default_factory=list)
 
     def add(self, other: Survey) -> None:
+        """Take over what another source holds."""
         self.pieces += other.pieces
         self.relations += other.relations
         self.declared_m |= other.declared_m
@@ -117,6 +118,7 @@ class Survey:
         self.findings += other.findings
 
     def report(self, severity: str, place: str, message: str, remedy: str = "") -> None:
+        """Note a finding."""
         self.findings.append(Finding(severity, place, message, remedy))  # type: ignore[arg-type]
 
 
@@ -153,7 +155,7 @@ def piece_of(
 
 
 def with_own_names(pieces: list[LinePiece]) -> list[LinePiece]:
-    """Each name once: the second of a name gets `#2`, in the order of the files."""
+    """Pieces with each name once: the second of a name gets `#2`, in the order of the files."""
     used: set[str] = set()
     named = []
     for piece in pieces:
@@ -167,14 +169,16 @@ def with_own_names(pieces: list[LinePiece]) -> list[LinePiece]:
     return named
 
 
-def kilometre_spans(line_km: Floats, way_m: Floats, config: SurveyConfig) -> tuple[Ints, Floats, np.ndarray]:
-    """Points with a kilometre; how far [m] the kilometres stray from the way to the next of them; where they jump."""
+def kilometre_spans(line_km: Floats, distance_m: Floats, config: SurveyConfig) -> tuple[Ints, Floats, np.ndarray]:
+    """Points with a kilometre; how far [m] the kilometres stray from the distance to the next of them; where they
+    jump.
+    """
     known = np.flatnonzero(np.isfinite(line_km))
     by_km = np.diff(line_km[known]) * 1000.0
-    by_way = np.diff(way_m[known])
+    by_distance = np.diff(distance_m[known])
     sign = 1.0 if by_km.sum() >= 0 else -1.0
-    off_m = np.abs(sign * by_km - by_way)
-    return known, off_m, off_m > np.maximum(config.kilometre_m, config.kilometre_share * by_way)
+    off_m = np.abs(sign * by_km - by_distance)
+    return known, off_m, off_m > np.maximum(config.kilometre_m, config.kilometre_share * by_distance)
 
 
 def measures_at(line_km: Floats, measure_m: Floats, km: float, config: SurveyConfig) -> list[float]:

@@ -8,7 +8,7 @@ import numpy as np
 import polars as pl
 
 from pipeline.make.receivers import as_run, gather
-from pipeline.make.receivers.convert import UnknownError
+from pipeline.make.receivers.messages import UnknownError
 from pipeline.make.survey.geojson_lines import read_geojson
 from pipeline.make.survey.map_files import MAP_SUFFIXES, read_map
 from pipeline.make.survey.pieces import Survey, content_of_survey, piece_of, with_own_names
@@ -52,6 +52,7 @@ def read_surveys(
 
 
 def _read(path: Path, epsg: int | None, vehicle: Vehicle, config: Configuration, id_field: str | None) -> Survey:
+    """A survey of whatever form."""
     suffix = path.suffix.lower()
     if path.is_dir() or suffix == ".mcap":
         return read_recorded(path, vehicle, config)
@@ -92,6 +93,7 @@ def read_recorded(path: Path, vehicle: Vehicle, config: Configuration) -> Survey
 
 
 def _of_run(run: RunLog, path: Path, vehicle: Vehicle, config: Configuration) -> Survey:
+    """A survey from the positions of a recorded run."""
     points = run.reference
     if points is None:
         fixed = run.gnss.filter(pl.col("fix").cast(pl.String) == Fix.RTK_FIXED.value)

@@ -57,6 +57,7 @@ def placed_table(place: str, data: bytes, epsg: int | None, config: SiteConfig) 
 
 
 def _in_degrees(place: str, table: pl.DataFrame, epsg: int | None, config: SiteConfig) -> pl.DataFrame:
+    """A table with coordinates in degrees, of whatever reference system."""
     if not {"x_m", "y_m"} <= set(table.columns) or "latitude_deg" in table.columns:
         return table
     if epsg is None:
@@ -76,6 +77,7 @@ def _in_degrees(place: str, table: pl.DataFrame, epsg: int | None, config: SiteC
 
 
 def _renamed(place: str, frame: pl.DataFrame) -> pl.DataFrame:
+    """A table with the names that surveys have here."""
     words = {name: word_of(name) for name in frame.columns}
     fitting = {name: [key for key, pattern in SURVEY.items() if re.fullmatch(pattern, words[name])] for name in words}
     meanings = {name: keys[0] for name, keys in fitting.items() if keys}

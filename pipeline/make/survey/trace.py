@@ -10,7 +10,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from pipeline.make.survey.pieces import LinePiece, Survey
-from pipeline.stages.track.geodesy import way_m
+from pipeline.stages.track.geodesy import distance_along_m
 from schemas.arrays import Bools, Floats, Ints, spans_of
 from schemas.config import SurveyConfig
 
@@ -43,6 +43,7 @@ def _all_thinned(pieces: list[LinePiece], surveyed: int, shape_m: float) -> list
 
 
 def _places(piece: LinePiece) -> list[tuple[float, float]]:
+    """Latitude and longitude of each point."""
     return list(zip(piece.latitude_deg.tolist(), piece.longitude_deg.tolist(), strict=True))
 
 
@@ -59,6 +60,7 @@ def _moving(piece: LinePiece, config: SurveyConfig) -> Ints:
 
 
 def _gapless(piece: LinePiece, survey: Survey, config: SurveyConfig) -> Iterator[LinePiece]:
+    """Parts of a recorded line between gaps."""
     steps = np.linalg.norm(np.diff(piece.surface, axis=0), axis=1)
     usual_m = float(np.median(steps)) if len(steps) else 0.0
     gaps = np.flatnonzero(steps > max(config.gap_m, config.gap_steps * usual_m))
@@ -70,15 +72,15 @@ def _gapless(piece: LinePiece, survey: Survey, config: SurveyConfig) -> Iterator
 
 
 def _new_track(piece: LinePiece, name: str, survey: Survey, config: SurveyConfig) -> list[LinePiece]:
-    """The stretches of a pass that no earlier one covers, itself included, thinned, each with the toe of its switch."""
+    """The stretches of a pass that no earlier one covers, itself included, thinned, each with its switch toe."""
     parts: list[LinePiece] = []
     known = list(survey.pieces)
-    for lap in _split_at_repeats(piece, config):
-        covered = _covered(lap.surface, known, config.same_track_m)
-        way = way_m(lap.surface)
+    for single_pass in _split_at_repeats(piece, config):
+        covered = _covered(single_pass.surface, known, config.same_track_m)
+        distance_m = distance_along_m(single_pass.surface)
         for first, last in spans_of(~covered):
-            if way[last] - way[first] >= config.toe_m:
-                parts.append(_with_toes(lap, first, last, known, config.toe_m))
+            if distance_m[last] - distance_m[first] >= config.toe_m:
+                parts.append(_with_switch_toes(single_pass, first, last, known, config.toe_m))
         known = [*survey.pieces, *parts]
         if covered.any():
             share = float(np.mean(covered))
@@ -88,9 +90,9 @@ def _new_track(piece: LinePiece, name: str, survey: Survey, config: SurveyConfig
 
 
 def _split_at_repeats(piece: LinePiece, config: SurveyConfig) -> Iterator[LinePiece]:
-    """A pass cut where it turns back or comes to where it was, so that each lap covers a place once."""
+    """A pass cut where it turns back or comes to where it was, so that each single pass covers a place once."""
     places = piece.surface
-    way = way_m(places)
+    distance_m = distance_along_m(places)
     rows = np.arange(len(piece))
     if not rows.size:
         return
@@ -98,8 +100,8 @@ def _split_at_repeats(piece: LinePiece, config: SurveyConfig) -> Iterator[LinePi
     turned = np.flatnonzero(np.einsum("ij,ij->i", unit[:-1], unit[1:]) < 0) + 2
     tree = cKDTree(places)
     near = tree.query_ball_point(places, config.same_track_m, return_sorted=True)
-    # An earlier row, more than two toes back along the way, lies within a step of this one.
-    again = np.array([way[row] - way[first] > 2 * config.toe_m for row, (first, *_) in enumerate(near)])
+    # An earlier row, more than two switch toes back along the path, lies within a step of this one.
+    again = np.array([distance_m[row] - distance_m[first] > 2 * config.toe_m for row, (first, *_) in enumerate(near)])
     starts = np.flatnonzero(again & ~np.append(False, again[:-1]))
     for part in np.split(rows, np.unique(np.concatenate([turned, starts]))):
         low = max(int(part[0]) - 1, 0)
@@ -114,36 +116,43 @@ def _covered(places: Floats, known: list[LinePiece], same_track_m: float) -> np.
     return np.asarray(tree.query(places)[0] <= same_track_m)
 
 
-def _with_toes(lap: LinePiece, first: int, last: int, known: list[LinePiece], toe_m: float) -> LinePiece:
+def _with_switch_toes(
+    single_pass: LinePiece, first: int, last: int, known: list[LinePiece], switch_toe_m: float
+) -> LinePiece:
     """The stretch, led back over the pass to where the branch left what is known, and on to where it comes back."""
-    part = lap.take(np.arange(first, last + 1))
-    if first > 0 and (toe := _toe(lap, first, -1, known, toe_m)) is not None:
-        part = replace(toe.followed_by(part), name=lap.name)
-    if last < len(lap) - 1 and (toe := _toe(lap, last, 1, known, toe_m)) is not None:
-        part = part.followed_by(toe)
+    part = single_pass.take(np.arange(first, last + 1))
+    if first > 0 and (switch_toe := _switch_toe(single_pass, first, -1, known, switch_toe_m)) is not None:
+        part = replace(switch_toe.followed_by(part), name=single_pass.name)
+    if (
+        last < len(single_pass) - 1
+        and (switch_toe := _switch_toe(single_pass, last, 1, known, switch_toe_m)) is not None
+    ):
+        part = part.followed_by(switch_toe)
     return part
 
 
-def _toe(lap: LinePiece, row: int, step: int, known: list[LinePiece], toe_m: float) -> LinePiece | None:
+def _switch_toe(
+    single_pass: LinePiece, row: int, step: int, known: list[LinePiece], switch_toe_m: float
+) -> LinePiece | None:
     """The end of known track that the row goes on from; else the known vertex nearest to where the train was a toe's
     length before (-1) or after (1) the row.
     """
-    places = lap.surface
+    places = single_pass.surface
     for piece in known:
         line = piece.surface
         for end, before in ((0, 1), (len(line) - 1, len(line) - 2)):
             ahead = places[row] - line[end]
             nearest = np.linalg.norm(line - places[row], axis=1).argmin() == end
-            if nearest and np.linalg.norm(ahead) < toe_m and ahead @ (line[end] - line[before]) > 0:
+            if nearest and np.linalg.norm(ahead) < switch_toe_m and ahead @ (line[end] - line[before]) > 0:
                 return piece.take([end])
     beyond = row
-    while 0 <= beyond + step < len(lap) and np.linalg.norm(places[beyond] - places[row]) < toe_m:
+    while 0 <= beyond + step < len(single_pass) and np.linalg.norm(places[beyond] - places[row]) < switch_toe_m:
         beyond += step
-    best: tuple[float, LinePiece | None] = (toe_m, None)
+    best: tuple[float, LinePiece | None] = (switch_toe_m, None)
     for piece in known:
-        way = np.linalg.norm(piece.surface - places[beyond], axis=1)
-        if len(way) and way.min() < best[0]:
-            best = float(way.min()), piece.take([int(np.argmin(way))])
+        apart_m = np.linalg.norm(piece.surface - places[beyond], axis=1)
+        if len(apart_m) and apart_m.min() < best[0]:
+            best = float(apart_m.min()), piece.take([int(np.argmin(apart_m))])
     return best[1]
 
 
@@ -151,9 +160,9 @@ def _dense(places: Floats) -> Floats:
     """Points at most a metre apart along a line."""
     if len(places) < 2:
         return places
-    way = way_m(places)
-    at = np.linspace(0.0, way[-1], int(way[-1]) + 2)
-    return np.column_stack([np.interp(at, way, places[:, axis]) for axis in range(3)])
+    distance_m = distance_along_m(places)
+    at = np.linspace(0.0, distance_m[-1], int(distance_m[-1]) + 2)
+    return np.column_stack([np.interp(at, distance_m, places[:, axis]) for axis in range(3)])
 
 
 def _thinned(piece: LinePiece, held: Bools, shape_m: float) -> LinePiece:
@@ -173,6 +182,7 @@ def _thinned(piece: LinePiece, held: Bools, shape_m: float) -> LinePiece:
 
 
 def _off_chord_m(places: Floats) -> Floats:
+    """Distance of points from the chord between the first and the last [m]."""
     chord = places[-1] - places[0]
     share = (places - places[0]) @ chord / max(float(chord @ chord), 1e-12)
     foot = places[0] + np.clip(share, 0.0, 1.0)[:, None] * chord

@@ -74,6 +74,7 @@ class _XmlLines:
         self.parser.StartDoctypeDeclHandler = self._refuse
 
     def _refuse(self, *_: object) -> None:
+        """Refuse a document type."""
         raise SiteError(
             "declares a document type, which no GPX and no KML needs",
             place=f"{self.place}: line {self.parser.CurrentLineNumber}",
@@ -81,6 +82,7 @@ class _XmlLines:
         )
 
     def _start(self, tag: str, attributes: dict[str, str]) -> None:
+        """Take note of the begin of an element."""
         local = tag.rpartition(" ")[2]
         self.root = self.root or local
         self.path.append(local)
@@ -98,6 +100,7 @@ class _XmlLines:
             self.points.append([self._number(attributes.get(key)) for key in ("lat", "lon")] + [None])
 
     def _end(self, tag: str) -> None:
+        """Take what an element holds at its end."""
         local = self.path.pop()
         text = "".join(self.text).strip()
         self.text.clear()
@@ -129,6 +132,7 @@ class _XmlLines:
         self.points.append([latitude, longitude, height[0] if height else None])
 
     def _number(self, text: str | None) -> float:
+        """A number, or a refusal that names its line."""
         try:
             return number_of(text or "")
         except ValueError:
@@ -136,6 +140,7 @@ class _XmlLines:
             raise SiteError("a coordinate cannot be read", place=where, found=repr(text)) from None
 
     def _close(self) -> None:
+        """Close a piece of track."""
         latitude, longitude, height = zip(*self.points, strict=True) if self.points else ((), (), ())
         if self.root == "kml" and self.mode != "absolute":
             height = (None,) * len(latitude)

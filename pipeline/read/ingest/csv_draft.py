@@ -38,7 +38,7 @@ _EMPTY = """
 """
 
 # One recorder's speed is mostly its receiver's: as odometer it would prove what it comes from (DOMAIN section 5.0).
-_BESIDE_POSITIONS = (
+_WITH_POSITIONS = (
     "# Beside positions: taken for the receiver's own, which is no odometer. Remove the # where it is a sensor's,\n"
     "# and say of which; where it is the receiver's, leave it out."
 )
@@ -83,7 +83,7 @@ def _stream(
     lines += _wrap_lines(table, columns_in(stream, numbers)) if stream == "odometer" and lines and not sensor else []
     unfit = _unfit(stream, table, {name: word for name, word in words.items() if name not in numbers})
     if stream == "odometer" and lines and set(columns_in("gnss", words)) >= POSITION:
-        lines = [_BESIDE_POSITIONS, *(line if line.startswith("#") else f"# {line}" for line in lines)]
+        lines = [_WITH_POSITIONS, *(line if line.startswith("#") else f"# {line}" for line in lines)]
     return "\n".join(["", *lines, *unfit]) + "\n" if lines or unfit else ""
 
 
@@ -103,8 +103,8 @@ def _kinds_of_fix(table: pl.DataFrame, words: Words) -> str | None:
     name = first(words, WORDS["fix"])
     if name is None or table[name].dtype != pl.String:
         return None
-    told = set(table[name].replace("", None).drop_nulls())
-    return name if told and told <= {kind.value for kind in Fix} else None
+    values = set(table[name].replace("", None).drop_nulls())
+    return name if values and values <= {kind.value for kind in Fix} else None
 
 
 def _reads(words: Words, file: str, time: tuple[list[str], float | None]) -> list[str]:
@@ -144,8 +144,8 @@ def _time_lines(table: pl.DataFrame, words: Words, units: Words) -> tuple[list[s
     if names[0] is None:
         return ['# time = "field:COLUMN"  # no name shows which column is the time'], None
     written = [name for name in names if name]
-    told = [zone for name in written for part in (name, f"({units.get(name, '')})") if (zone := zone_in(part)[0])]
-    if told and (lines := _in_zone(told[0], written, table)):
+    zones = [zone for name in written for part in (name, f"({units.get(name, '')})") if (zone := zone_in(part)[0])]
+    if zones and (lines := _in_zone(zones[0], written, table)):
         return lines, None
     if any("gpsepoch" in words[name] for name in written):
         return [_field(*written), 'time_epoch = "gps"', 'time_scale = "gps"'], _since_gps(words[written[0]])

@@ -32,6 +32,7 @@ _GEOID = "# height_m: only a height over the ellipsoid; one over the sea is anot
 
 
 def one_line(text: str) -> str:
+    """The text with every run of white space as one space."""
     return " ".join(text.split())
 
 
@@ -59,11 +60,11 @@ def zone_in(name: str) -> tuple[str | None, str]:
         return (None if re.fullmatch(r"[+-][0:]+", hours) else f"UTC{hours}"), name.replace(offset[0], "")
     apart = re.sub(r"(?<=[a-ząćęłńóśźż])(?=[A-Z])", " ", name)
     words = re.findall(r"[^\W_]+", re.sub(r"(?i)(?<=local|lokal)(?=time|zeit)|(?<=orts)(?=zeit)", " ", apart))
-    told = [word for word in words if re.fullmatch(ZONES["local"] + "|orts", word.lower())]
+    declared = [word for word in words if re.fullmatch(ZONES["local"] + "|orts", word.lower())]
     bracket = re.search(r"[\[(<]\s*([^\])>]*?)\s*[\])>]", name)
-    if not told and bracket and not all(re.fullmatch(ZONES["utc"], word) for word in _words(bracket[1])):
+    if not declared and bracket and not all(re.fullmatch(ZONES["utc"], word) for word in _words(bracket[1])):
         return bracket[1], name.replace(bracket[0], "")
-    return " ".join(told) or None, " ".join(word for word in words if word not in told) if told else name
+    return " ".join(declared) or None, " ".join(word for word in words if word not in declared) if declared else name
 
 
 def words_of_times(names: Iterable[str]) -> dict[str, str]:

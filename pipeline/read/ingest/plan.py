@@ -189,6 +189,7 @@ def _may_follow(sample: Sample, recipe: Recipe, path: str) -> bool:
 
 
 def missing_field(channel: Channel, fields: Iterable[str], column: str, absent: Sequence[str]) -> InputError:
+    """The error for a column whose fields the messages lack."""
     return InputError(
         f"has no field {', '.join(absent)} for column {column}",
         place=channel.place,

@@ -50,6 +50,7 @@ class SourceReader:
 
     @property
     def slow_messages(self) -> int:
+        """How many messages were decoded one by one."""
         return self._decoder.slow_messages
 
     def add(self, messages: Messages) -> None:

@@ -48,6 +48,7 @@ class Recipe:
         return list(dict.fromkeys(self.columns[column].meta.root_names()))
 
     def type_of(self, path: str) -> pl.DataType:
+        """The dtype of a field: whole numbers where the recipe says so, else floats."""
         return self.types.get(path, pl.Int64() if path in self.whole else pl.Float64())
 
 

@@ -18,13 +18,25 @@ _DEFAULTS = IngestConfig()
 
 
 def read_run(path: Address, config: IngestConfig = _DEFAULTS, with_digest: bool = True) -> RunLog:
-    """One run from `RUN.mcap` or a folder `RUN/` of Parquet files (CONTRACT section 1).
+    """Read one run from `RUN.mcap` or a folder `RUN/` of Parquet files.
 
-    `with_digest`: also the SHA-256 of its files, which results are stamped with; else `input_digest` is empty.
+    Every stream has exactly the contract's columns and types; rows stay in recorded order, duplicates included. What
+    the configuration corrects in the streams is corrected (`[[ingest.correct]]`).
 
-    Every stream has exactly the contract's columns and types; rows stay in recorded order, duplicates
-    included. Raises one `InputError` that lists all breaches; a log that is cut off is read up to the
-    damage and says so in `notes`. What the configuration corrects in the streams is corrected (`[[ingest.correct]]`).
+    Args:
+        path: address of `RUN.mcap` or of a folder `RUN/`; local or `s3://`-style.
+        config: the section `ingest` of the configuration: mapping of topics and corrections.
+        with_digest: compute the SHA-256 of its files, which results are stamped with; else `input_digest` is empty.
+
+    Returns:
+        The run: one frame per stream, in the units of the contract.
+
+    Raises:
+        InputError: the log breaches the contract; all breaches in one. A log that is cut off is read up to the damage
+            and says so in `notes`.
+
+    Source:
+        CONTRACT section 1.
     """
     return corrected(_limited(_recorded(path, config, with_digest), path, config), config.correct)
 

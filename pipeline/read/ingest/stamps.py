@@ -135,10 +135,12 @@ class CivilTime:
 
     @property
     def fields(self) -> tuple[str, ...]:
+        """Fields that make a time."""
         return (*self.calendar, self.nanoseconds, self.valid)
 
     @property
     def types(self) -> Mapping[str, pl.DataType]:
+        """Their dtypes."""
         return {name: pl.Int64() for name in self.fields}
 
     def instants(self, frame: pl.DataFrame, name: str) -> pl.Series:

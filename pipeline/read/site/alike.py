@@ -11,7 +11,7 @@ import polars as pl
 
 from pipeline.stages.lds.crossings import DEFAULTS, minimal_spacing_m, window_m
 from pipeline.stages.paths.candidates import candidates_of, search_about
-from pipeline.stages.paths.path_tests import told_by_a_switch_m, told_by_offset_m
+from pipeline.stages.paths.path_tests import offset_resolution_m, switch_resolution_m
 from pipeline.stages.track.geodesy import points_of
 from pipeline.stages.track.network import Edge, Network, network_of, surveyed
 from pipeline.stages.track.path import Chain, search, valid_along_measure
@@ -37,27 +37,27 @@ class _Point:
     at_m: float
 
 
-_TOLD = 3
+_SHOWN = 3
 """So many warnings stand in a few lines."""
 
 
 def ambiguities(site: Site, config: Configuration = _WHOLE) -> tuple[Finding, ...]:
-    """What costs availability wherever trains run on this site: tracks, then balises, that cannot be told apart."""
+    """What costs availability wherever trains run on this site: tracks, then balises, that look alike."""
     return (*parallel_findings(site, config), *window_findings(site, config.lds, config.site))
 
 
-def told_in_short(findings: Iterable[Finding], where: str) -> list[str]:
+def summarise_findings(findings: Iterable[Finding], where: str) -> list[str]:
     """The first warnings, each a line; `where`: what lists them all."""
     warnings = [finding for finding in findings if finding.severity == "warning"]
-    lines = [f"{one.place}: {one.message}. {one.remedy}".rstrip() for one in warnings[:_TOLD]]
-    more = len(warnings) - _TOLD
+    lines = [f"{one.place}: {one.message}. {one.remedy}".rstrip() for one in warnings[:_SHOWN]]
+    more = len(warnings) - _SHOWN
     return lines + ([f"and {more} more warnings: {where}"] if more > 0 else [])
 
 
 def window_findings(site: Site, config: LdsConfig = DEFAULTS, limits: SiteConfig = _DEFAULTS) -> list[Finding]:
     """One warning per pair of announced balises whose windows overlap, both measured from a balise before them.
 
-    Ways over several net elements and switches count, in each direction that navigability allows. Virtual and
+    Routes over several net elements and switches count, in each direction that navigability allows. Virtual and
     physical balises are linked apart.
     """
     if site.balises is None:
@@ -92,17 +92,17 @@ def _points(balises: pl.DataFrame, network: Network) -> dict[int, list[_Point]]:
     }
 
 
-_Met = tuple[_Point, float]
+_OnChain = tuple[_Point, float]
 """A balise with its distance from the reference [m]."""
 
 
 def _ahead(
     network: Network, points: dict[int, list[_Point]], oriented: int, index: int, announced_m: float
-) -> Iterator[tuple[_Met, _Met]]:
+) -> Iterator[tuple[_OnChain, _OnChain]]:
     """The next two balises on each way ahead of one, as far as it is announced."""
     reference = points[oriented][index]
 
-    def met(chain: Chain) -> tuple[_Met, ...]:
+    def on_chain(chain: Chain) -> tuple[_OnChain, ...]:
         entered = zip(chain.oriented, chain.entry_m, strict=True)
         on_way = (
             (point, entry_m + point.at_m)
@@ -112,18 +112,19 @@ def _ahead(
         return tuple(islice(on_way, 2))
 
     def onward(chain: Chain) -> list[Edge]:
-        return [edge for edge in network.successors[chain.oriented[-1]] if edge.forward and len(met(chain)) < 2]
+        return [edge for edge in network.successors[chain.oriented[-1]] if edge.forward and len(on_chain(chain)) < 2]
 
     def same(chain: Chain) -> tuple[int, tuple[str, ...]]:
-        return chain.oriented[-1], tuple(point.balise_id for point, _ in met(chain))
+        return chain.oriented[-1], tuple(point.balise_id for point, _ in on_chain(chain))
 
     begin = Chain((oriented,), (-reference.at_m,))
     for found in search(network, begin, announced_m, onward, same):
-        if len(pair := met(found.chain)) == 2:
+        if len(pair := on_chain(found.chain)) == 2:
             yield pair[0], pair[1]
 
 
-def _judge(reference: _Point, near: _Met, far: _Met, config: LdsConfig) -> Finding | None:
+def _judge(reference: _Point, near: _OnChain, far: _OnChain, config: LdsConfig) -> Finding | None:
+    """A warning if the expectation windows of two balises on a chain overlap."""
     (expected, distance_m) = near
     (later, later_m) = far
     close_m = window_m(distance_m, expected.accuracy_m, reference.accuracy_m, config).close_m
@@ -167,7 +168,7 @@ def parallel_findings(site: Site, config: Configuration = _WHOLE) -> list[Findin
     ]
 
 
-class TracksTold(NamedTuple):
+class TrackResolution(NamedTuple):
     """Per net element how far aside another track has to lie to be told from it with exact positions [m]."""
 
     survey_m: Floats
@@ -175,17 +176,17 @@ class TracksTold(NamedTuple):
     by_switch_m: Floats
 
 
-def tracks_told(track: SurveyedTrack, config: MatchingConfig) -> TracksTold:
-    """By a lasting offset, and by a switch taken, at the survey's stated sigma."""
+def track_resolution(track: SurveyedTrack, config: MatchingConfig) -> TrackResolution:
+    """Distance between tracks that a lasting offset, and that a switch taken can resolve [m]."""
     survey_m = _survey_m(track, config)
-    return TracksTold(
+    return TrackResolution(
         survey_m,
-        told_by_offset_m(survey_m, config.paths_alpha, config.cross_bias_sigma_m),
-        told_by_a_switch_m(survey_m, config.paths_alpha, config.paths_alike_m),
+        offset_resolution_m(survey_m, config.paths_alpha, config.cross_bias_sigma_m),
+        switch_resolution_m(survey_m, config.paths_alpha, config.paths_alike_m),
     )
 
 
-class Beside(NamedTuple):
+class NeighbourPairs(NamedTuple):
     """Places along elements with another one beside them, by pair of elements and then along the first."""
 
     pair: Ints
@@ -193,15 +194,15 @@ class Beside(NamedTuple):
     measure_m: Floats
     apart_m: Floats
 
-    def parts(self) -> Iterator[Beside]:
+    def parts(self) -> Iterator[NeighbourPairs]:
         """Stretches of one pair without a place missing."""
         cuts = np.flatnonzero((np.diff(self.pair) != 0) | (np.diff(self.row) > 1)) + 1
         for rows in np.split(np.arange(self.row.size), cuts) if self.row.size else ():
-            yield Beside(self.pair[rows], self.row[rows], self.measure_m[rows], self.apart_m[rows])
+            yield NeighbourPairs(self.pair[rows], self.row[rows], self.measure_m[rows], self.apart_m[rows])
 
 
-def tracks_beside(network: Network, limit_m: Floats, config: MatchingConfig) -> Beside:
-    """Where another track lies nearer than the limit of an element; each pair once, as places of the first."""
+def neighbouring_tracks(network: Network, limit_m: Floats, config: MatchingConfig) -> NeighbourPairs:
+    """Places where another track lies nearer than the limit of an element; each pair once, as of the first."""
     along = places_along(network.track, SAMPLE_SPACING_M)
     element = along.element
     points = points_of(along.latitude_deg, along.longitude_deg)
@@ -215,13 +216,13 @@ def tracks_beside(network: Network, limit_m: Floats, config: MatchingConfig) -> 
     row = near_track.step[near]
     order = np.lexsort((row, pairs))
     row = row[order]
-    return Beside(pairs[order], row, along.measure_m[row], near_track.distance_m[near][order])
+    return NeighbourPairs(pairs[order], row, along.measure_m[row], near_track.distance_m[near][order])
 
 
 def _stretches(network: Network, config: MatchingConfig) -> Iterator[_ParallelStretch]:
-    """Per pair of elements the parts of the first that lie too near the second."""
-    told = tracks_told(network.track, config)
-    for part in tracks_beside(network, np.fmax(told.by_offset_m, told.by_switch_m), config).parts():
+    """Parts of the first of each pair of elements that lie too near the second."""
+    resolution = track_resolution(network.track, config)
+    for part in neighbouring_tracks(network, np.fmax(resolution.by_offset_m, resolution.by_switch_m), config).parts():
         one, other = divmod(int(part.pair[0]), network.count)
         ends_m = float(part.measure_m[0]), float(part.measure_m[-1])
         yield _ParallelStretch(one, other, *ends_m, float(np.median(part.apart_m)))
@@ -231,7 +232,7 @@ def _finding(site: Site, network: Network, stretch: _ParallelStretch, config: Ma
     name = network.track.ids[stretch.element]
     parallel = network.track.ids[stretch.other]
     survey_m = _survey_m(network.track, config)[stretch.element]
-    needed_m = float(told_by_a_switch_m(survey_m, config.paths_alpha, config.paths_alike_m))
+    needed_m = float(switch_resolution_m(survey_m, config.paths_alpha, config.paths_alike_m))
     by_a_switch = (
         f"a switch taken tells them apart at a survey of {survey_m:.2g} m"
         if stretch.apart_m > needed_m
@@ -246,19 +247,19 @@ def _finding(site: Site, network: Network, stretch: _ParallelStretch, config: Ma
 
 def _remedy(site: Site, network: Network, stretch: _ParallelStretch) -> str:
     """What would tell: a route always, reads and switches where there are some."""
-    ways = ["a route (`balise replay --write-route`, `--route`)"]
+    means = ["a route (`balise replay --write-route`, `--route`)"]
     names = [network.track.ids[stretch.element], network.track.ids[stretch.other]]
     balises = [] if site.balises is None else site.balises.select("balise_id", "netelement_id", "kind").rows()
     reads = [balise for balise, name, kind in balises if name in names and str(kind) == BaliseKind.PHYSICAL.value]
     if reads:
-        ways.append(f"a read of {', '.join(reads[:3])}")
+        means.append(f"a read of {', '.join(reads[:3])}")
     oriented = [2 * element + sense for element in (stretch.element, stretch.other) for sense in (0, 1)]
     if any(len(network.successors[side]) > 1 for side in oriented):
-        ways.append("a switch taken at its end")
-    return f"To tell the two apart: {', '.join(ways)}."
+        means.append("a switch taken at its end")
+    return f"To tell the two apart: {', '.join(means)}."
 
 
 def _survey_m(track: SurveyedTrack, config: MatchingConfig) -> Floats:
-    """Per element the survey's sigma, the least of its points; the configured one where it states none."""
+    """Survey sigma of each element, the least of its points [m]; the configured one where it states none."""
     stated = np.where(np.isfinite(track.sigma_m), track.sigma_m, config.survey_sigma_default_m)
     return np.asarray(np.minimum.reduceat(stated, track.first[:-1]))

@@ -127,14 +127,14 @@ def _relations_that_differ(links: pl.DataFrame, related: tuple[Ints, Ints]) -> I
     repeated = links.filter(pl.Series(times[same.ravel()] > 1, dtype=pl.Boolean))
     words: dict[tuple[tuple[str, int], tuple[str, int]], list[str]] = {}
     from_other = {Navigability.AB.value: Navigability.BA.value, Navigability.BA.value: Navigability.AB.value}
-    for a, a_end, b, b_end, way in repeated.iter_rows():
+    for a, a_end, b, b_end, navigability in repeated.iter_rows():
         if (a, a_end) <= (b, b_end):
-            words.setdefault(((a, a_end), (b, b_end)), []).append(way)
+            words.setdefault(((a, a_end), (b, b_end)), []).append(navigability)
         else:
-            words.setdefault(((b, b_end), (a, a_end)), []).append(from_other.get(way, way))
-    for ((a, a_end), (b, b_end)), ways in words.items():
-        if len(set(ways)) > 1:
-            text = f"end {a_end} of {a} and end {b_end} of {b} are related as {' and as '.join(dict.fromkeys(ways))}"
+            words.setdefault(((b, b_end), (a, a_end)), []).append(from_other.get(navigability, navigability))
+    for ((a, a_end), (b, b_end)), kinds in words.items():
+        if len(set(kinds)) > 1:
+            text = f"end {a_end} of {a} and end {b_end} of {b} are related as {' and as '.join(dict.fromkeys(kinds))}"
             yield Finding("warning", "links", f"{text}: what either allows counts", "Correct the relations.")
 
 
@@ -161,11 +161,11 @@ def _relations_that_turn_back(
         Finding(
             "warning",
             "links",
-            f"end {a_end} of {a} and end {b_end} of {b} are linked as navigable ({way}), but a train would have to "
-            "turn by more than 90 degrees there: taken as not navigable",
+            f"end {a_end} of {a} and end {b_end} of {b} are linked as navigable ({navigability}), but a train would "
+            "have to turn by more than 90 degrees there: taken as not navigable",
             "Correct the relation.",
         )
-        for a, a_end, b, b_end, way in links.filter(back).iter_rows()
+        for a, a_end, b, b_end, navigability in links.filter(back).iter_rows()
     ]
     closed = pl.when(back).then(pl.lit(Navigability.NONE.value))
     return links.with_columns(navigability=closed.otherwise("navigability")), findings
@@ -240,6 +240,7 @@ def _check_kinks(
 
 
 def _check_heights(track: SurveyedTrack, collected: Remarks) -> None:
+    """Refuse sites of which only some net elements have heights."""
     # An element has all heights or none.
     flat = [track.ids[element] for element in np.flatnonzero(np.isnan(track.height_m[track.first[:-1]])).tolist()]
     if flat and len(flat) < len(track.ids):
@@ -345,12 +346,12 @@ def _nearly_met(places: Floats, inward: Floats, free: np.ndarray, config: SiteCo
     near = near[onward & free[near].any(axis=1)]
     alone = np.flatnonzero(free)
     far = alone[_pairs_within(places[alone], config.facing_m)]
-    way = places[far[:, 1]] - places[far[:, 0]]
-    gap = np.linalg.norm(way, axis=1)
-    ahead = [sign * np.einsum("ij,ij->i", inward[far[:, side]], way) for side, sign in ((0, -1.0), (1, 1.0))]
-    facing = (gap > config.near_ends_m) & (np.minimum(*ahead) > gap * config.facing_cosine)
+    across = places[far[:, 1]] - places[far[:, 0]]
+    gap = np.linalg.norm(across, axis=1)
+    ahead = [sign * np.einsum("ij,ij->i", inward[far[:, side]], across) for side, sign in ((0, -1.0), (1, 1.0))]
+    opposite = (gap > config.near_ends_m) & (np.minimum(*ahead) > gap * config.facing_cosine)
     nearest: dict[int, int] = {}
-    for row in np.flatnonzero(facing)[np.argsort(gap[facing], kind="stable")].tolist():
+    for row in np.flatnonzero(opposite)[np.argsort(gap[opposite], kind="stable")].tolist():
         for end in far[row].tolist():
             nearest.setdefault(end, row)
     both = [far[row] for row in set(nearest.values()) if all(nearest[end] == row for end in far[row].tolist())]
@@ -359,6 +360,7 @@ def _nearly_met(places: Floats, inward: Floats, free: np.ndarray, config: SiteCo
 
 
 def _check_balises(track: SurveyedTrack, balises: pl.DataFrame, collected: Remarks) -> None:
+    """Refuse balises that a site cannot have."""
     repeated = balises.filter(pl.col("balise_id").is_duplicated())["balise_id"].unique().sort().to_list()
     if repeated:
         collected.breaches.append(f"balises: column balise_id: {', '.join(repeated[:3])} occur more than once")

@@ -15,14 +15,14 @@ from schemas.run import Finding, Site
 def describe_site(site: Site) -> dict[str, object]:
     """Figures of a site by name; lengths and spacings in metres, `box_deg` south, west, north, east.
 
-    `parts` counts connected pieces of network, `switches` ends from which more than one way leads on.
+    `parts` counts connected pieces of network, `switches` ends from which more than one relation leads on.
     """
     track = surveyed(site)
     network = network_of(track, site.links)
     spacing = np.concatenate([np.diff(track.measure_m[part]) for _, _, part in track.elements()])
     known = track.sigma_m[np.isfinite(track.sigma_m)]
     kinds = [] if site.balises is None else site.balises["kind"].cast(str).to_list()
-    ways = np.diff(network.successors.first)
+    branches = np.diff(network.successors.first)
     return {
         "elements": len(track.ids),
         "points": len(track.measure_m),
@@ -36,8 +36,8 @@ def describe_site(site: Site) -> dict[str, object]:
         "without_sigma": int(np.isnan(track.sigma_m).sum()),
         "relations": dict(sorted(Counter(site.links["navigability"].cast(str).to_list()).items())),
         "parts": len(np.unique(network.connected)),
-        "switches": int((ways > 1).sum()),
-        "open_ends": int((ways == 0).sum()),
+        "switches": int((branches > 1).sum()),
+        "open_ends": int((branches == 0).sum()),
         "balises": dict(sorted(Counter(kinds).items())),
         "route_elements": None if site.route is None else site.route.height,
         "box_deg": (
@@ -58,11 +58,11 @@ def without_balises(balises: pl.DataFrame | None) -> tuple[Finding, ...]:
 
 
 def elements_table(site: Site) -> pl.DataFrame:
-    """Per net element its id, length [m], points, balises, and the elements that a train can reach from either end."""
+    """Net elements with length [m], points, balises, and the elements a train can reach from either end."""
     track = surveyed(site)
     reached: dict[tuple[str, int], list[str]] = {}
-    for a, a_end, b, b_end, way in site.links.iter_rows():
-        if way != "none":
+    for a, a_end, b, b_end, navigability in site.links.iter_rows():
+        if navigability != "none":
             reached.setdefault((a, a_end), []).append(b)
             reached.setdefault((b, b_end), []).append(a)
     counts = Counter([] if site.balises is None else site.balises["netelement_id"].to_list())
@@ -82,6 +82,7 @@ def elements_table(site: Site) -> pl.DataFrame:
 
 
 def _dimensions(track: SurveyedTrack) -> str:
+    """Whether a site has heights, for people."""
     flat = [bool(np.isnan(track.height_m[part]).any()) for _, _, part in track.elements()]
     if all(flat):
         return "2-D"

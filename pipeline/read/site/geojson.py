@@ -84,15 +84,17 @@ def latitude_first(document: Mapping[str, Any]) -> bool:
 
 
 def has_relations(features: Iterable[Any]) -> bool:
-    """Net relations stand beside the lines: a network that says itself where trains can run. Raises `ValueError`."""
+    """Whether net relations come with the lines: a network that says where trains can run. Raises `ValueError`."""
     return any(_is_relation(_plain_keys(None, parts_of(feature)[0])) for feature in features)
 
 
 def _is_relation(keys: Mapping[str, Any]) -> bool:
+    """Whether a feature links net elements."""
     return any(key in keys for key in (*_A_KEYS, *_B_KEYS))
 
 
 def _network(file: str, features: list[Any], epsg: int, breaches: list[str]) -> GeoJsonNetwork:
+    """Net elements and links of features."""
     points: list[tuple[Any, ...]] = []
     relations: list[tuple[Any, ...]] = []
     lengths: dict[str, float] = {}
@@ -147,6 +149,7 @@ def _plain_keys(own_id: Any, properties: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _first(keys: Mapping[str, Any], names: tuple[str, ...]) -> Any:
+    """The first of several keys that a feature has."""
     return next((keys[name] for name in names if keys.get(name) is not None), None)
 
 
@@ -173,6 +176,7 @@ def _element(geometry: Mapping[str, Any], keys: Mapping[str, Any], lengths: dict
 
 
 def _metres(value: Any) -> float | None:
+    """A number of metres, if it is one."""
     if value is None:
         return None
     if isinstance(value, bool) or not isinstance(value, int | float) or not abs(value) < 2**1023:
@@ -183,6 +187,7 @@ def _metres(value: Any) -> float | None:
 
 
 def _relation(keys: Mapping[str, Any]) -> tuple[Any, ...]:
+    """A link of two net elements."""
     ends = [_referred(_first(keys, names)) for names in (_A_KEYS, _B_KEYS)]
     positions = [_position(keys, names, origin) for names, origin in (_POSITIONS_A, _POSITIONS_B)]
     # Vocabularies give the word as the last part of an address.

@@ -6,13 +6,13 @@ import numpy as np
 import polars as pl
 from numpy.lib.stride_tricks import sliding_window_view
 
-from pipeline.read.site.alike import tracks_beside, tracks_told
+from pipeline.read.site.alike import neighbouring_tracks, track_resolution
 from pipeline.stages.track.network import network_of, surveyed
 from schemas.arrays import Floats
 from schemas.config import Configuration
 from schemas.run import Site
 
-_TOLD_BY = ("nothing but a route or a read", "a switch taken", "the offset")
+_RESOLVED_BY = ("nothing but a route or a read", "a switch taken", "the offset")
 _COLUMNS: dict[str, type[pl.DataType]] = {
     "netelement_id": pl.String,
     "from_m": pl.Float64,
@@ -39,24 +39,27 @@ def neighbours(site: Site, config: Configuration) -> pl.DataFrame:
         return pl.DataFrame(schema=_COLUMNS)
     network = network_of(surveyed(site), site.links)
     ids = network.track.ids
-    told = tracks_told(network.track, config.matching)
-    limit_m = np.fmax(_NEIGHBOUR_M, np.fmax(told.by_offset_m, told.by_switch_m))
+    resolution = track_resolution(network.track, config.matching)
+    limit_m = np.fmax(_NEIGHBOUR_M, np.fmax(resolution.by_offset_m, resolution.by_switch_m))
     rows = []
-    for part in tracks_beside(network, limit_m, config.matching).parts():
+    for part in neighbouring_tracks(network, limit_m, config.matching).parts():
         one, other = divmod(int(part.pair[0]), network.count)
         apart_m = _smoothed(part.apart_m)
-        offset_m, switch_m = float(told.by_offset_m[one]), float(told.by_switch_m[one])
+        offset_m, switch_m = float(resolution.by_offset_m[one]), float(resolution.by_switch_m[one])
         kind = np.where(apart_m >= offset_m, 2, np.where(apart_m >= switch_m, 1, 0))
         for stretch in np.split(np.arange(kind.size), np.flatnonzero(np.diff(kind)) + 1):
             ends_m = float(part.measure_m[stretch[0]]), float(part.measure_m[stretch[-1]])
             if ends_m[1] - ends_m[0] >= config.site.parallel_least_m:
                 apart = float(np.median(part.apart_m[stretch]))
-                by = _TOLD_BY[int(kind[stretch[0]])]
-                rows.append((ids[one], *ends_m, ids[other], apart, float(told.survey_m[one]), by, offset_m, switch_m))
+                by = _RESOLVED_BY[int(kind[stretch[0]])]
+                rows.append(
+                    (ids[one], *ends_m, ids[other], apart, float(resolution.survey_m[one]), by, offset_m, switch_m)
+                )
     return pl.DataFrame(rows, schema=_COLUMNS, orient="row")
 
 
 def _smoothed(apart_m: Floats) -> Floats:
+    """Distances, smoothed by a running median."""
     if apart_m.size < _PLACES:
         return apart_m
     padded = np.pad(apart_m, _PLACES // 2, mode="edge")

@@ -34,16 +34,26 @@ _DEFAULTS = SiteConfig()
 
 
 def read_site(path: Path | str, config: SiteConfig = _DEFAULTS) -> Site:
-    """The site of a folder (CONTRACT section 2) or of one GeoJSON file with track and links, positions in WGS 84.
+    """Read the site of a folder or of one GeoJSON file with track and links, positions in WGS 84.
 
-    `track` is Parquet, CSV or RailTopoModel GeoJSON; each file may name its EPSG code: Parquet in its
-    key-value metadata (`epsg`), CSV in a comment line (`# epsg: 31370`), both in a column `epsg`, GeoJSON
-    in its `crs` member. In a projected system `longitude_deg` holds the easting and `latitude_deg` the
-    northing, or the columns are named `x_m` and `y_m`. Heights are taken as they are (ellipsoidal).
-    `measure_m` empty for a whole element: its geometric length. A route's `direction` is AB, growing or
-    forward (from the element's start to its end), or BA, falling or reverse.
+    `track` is Parquet, CSV or RailTopoModel GeoJSON; each file may name its EPSG code: Parquet in its key-value
+    metadata (`epsg`), CSV in a comment line (`# epsg: 31370`), both in a column `epsg`, GeoJSON in its `crs` member. In
+    a projected system `longitude_deg` holds the easting and `latitude_deg` the northing, or the columns are named `x_m`
+    and `y_m`. Heights are taken as they are (ellipsoidal). `measure_m` empty for a whole element: its geometric length.
+    A route's `direction` is AB, growing or forward (from the element's start to its end), or BA, falling or reverse.
 
-    Raises `SiteError` with all breaches at once; what is merely remarkable is in `Site.findings`.
+    Args:
+        path: the folder, or the GeoJSON file; local or `s3://`-style.
+        config: the section `site` of the configuration: limits of its checks [m].
+
+    Returns:
+        Track, links, balises and route; what is merely remarkable is in `Site.findings`.
+
+    Raises:
+        SiteError: the site breaches the contract; all breaches at once.
+
+    Source:
+        CONTRACT section 2.
     """
     files = _files(path)
     breaches: list[str] = []
@@ -123,12 +133,14 @@ def _digest(files: dict[str, bytes]) -> str:
 
 
 def _refusal(path: Path | str, breaches: list[str]) -> SiteError:
+    """The error for a site with all that is wrong with it."""
     remedy = "Correct what is named; `balise dictionary` lists the columns of a site."
     remedy = f"Correct what is named. {_MAKE_A_SITE}" if is_geojson(path) else remedy
     return SiteError(listed(breaches), place=shown(path), remedy=remedy)
 
 
 def _load(files: dict[str, bytes], table: str, breaches: list[str]) -> RawTable | None:
+    """A table of a site, if there is a file of it."""
     name = next((name for name in files if name.startswith(f"{table}.")), None)
     return None if name is None else load_table(name, files[name], breaches)
 
@@ -196,6 +208,7 @@ def to_wgs84(raw: RawTable, frame: pl.DataFrame, config: SiteConfig, breaches: l
 
 
 def _transformed(raw: RawTable, frame: pl.DataFrame, config: SiteConfig, breaches: list[str]) -> pl.DataFrame:
+    """A table with coordinates in degrees, of projected ones."""
     import pyproj
 
     try:

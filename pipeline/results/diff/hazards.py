@@ -34,6 +34,7 @@ class HazardChange:
 
     @property
     def _deciding(self) -> list[str]:
+        """Differences in columns that decide about a hazard."""
         return [item.column for item in self.differences if item.column in _DECIDING]
 
     @property
@@ -43,6 +44,7 @@ class HazardChange:
 
     @property
     def _head(self) -> str:
+        """Which hazard it is, and how it changed, for people."""
         return f"{self.hazard} at {self.t_hazard} ({self.solution}) {self.change}"
 
     @property
@@ -57,9 +59,17 @@ class HazardChange:
 def compare_hazards(
     a: pl.DataFrame, b: pl.DataFrame, rules: Rules = NO_RULES
 ) -> tuple[list[Difference], list[HazardChange]]:
-    """Differences of the tables' schemas, and the hazards that appeared, vanished or changed, in time order.
+    """Differences of the tables' schemas, and the hazards that appeared, vanished or changed.
 
     The numbers of hazards (`hazard_id`, `caused_by`) count as changed only where none came or went.
+
+    Args:
+        a: hazards of the first result.
+        b: hazards of the second one.
+        rules: what may differ.
+
+    Returns:
+        Differences of the schemas, and the changes in order of time.
     """
     schema = [item for item in compare_tables(a.clear(), b.clear(), Hazards, rules=rules) if item.kind == "schema"]
     if any(item.column in {"solution", "hazard", "t_hazard"} for item in schema):

@@ -59,6 +59,7 @@ class RunDiff:
 
     @property
     def same(self) -> bool:
+        """Nothing differs."""
         return not (self.hazards or self.differences)
 
     @property
@@ -69,7 +70,7 @@ class RunDiff:
 
     @property
     def other_columns(self) -> set[str]:
-        """Columns that changed beside verdicts, hazards and balises."""
+        """Columns that changed, other than verdicts, hazards and balises."""
         shown = {"runs.verdict", "passages.status", *(f"runs.{name}" for name in BALISE_COUNTS)}
         return {item.place for item in self.differences} - shown
 
@@ -86,10 +87,11 @@ class ResultDiff:
 
     @property
     def same(self) -> bool:
+        """The same runs, and nothing differs in any."""
         return not (self.only_in_a or self.only_in_b or self.runs)
 
     def text(self, detail: bool = False) -> str:
-        """For people: how much changed, then verdicts, hazards and balises; in `detail` also every other value."""
+        """How much changed, for people; then verdicts, hazards and balises, in `detail` also every other value."""
         lines = [self._sentence(), *(f"note: {note}" for note in self.notes)]
         lines += [f"{run}: only in A" for run in self.only_in_a] + [f"{run}: only in B" for run in self.only_in_b]
         lines += _section("Verdicts", [(run.run_id, text) for run in self.runs for text in run.verdicts], detail)
@@ -102,12 +104,13 @@ class ResultDiff:
         return "\n".join(lines)
 
     def _sentence(self) -> str:
+        """How many runs were compared, and how many changed, for people."""
         verdict = "all the same" if not self.runs else f"{len(self.runs)} changed"
         alone = [f"{len(runs)} only in {name}" for runs, name in ((self.only_in_a, "A"), (self.only_in_b, "B")) if runs]
         return ", ".join([f"{self.compared} runs in both: {verdict}", *alone])
 
     def _hazards(self) -> list[tuple[str, str]]:
-        """Those that came, went or were judged otherwise, and how many have other figures only."""
+        """Hazards that came, went or were judged otherwise, and how many have other figures only."""
         rows = [(run.run_id, item.short) for run in self.runs for item in run.hazards if item.matters]
         figures = Counter(run.run_id for run in self.runs for item in run.hazards if not item.matters)
         return rows + [(run_id, f"{count} with other figures only") for run_id, count in figures.items()]
@@ -122,14 +125,22 @@ class ResultDiff:
         return ["", f"Other columns that changed: {listed}{more}. --detail shows the values."]
 
     def as_dict(self) -> dict[str, object]:
-        """For programs: plain values, as JSON holds them."""
+        """The difference for programs: plain values, as JSON holds them."""
         return {"same": self.same, **asdict(self)}
 
 
 def diff_results(out_a: Address, out_b: Address, rules: Rules = NO_RULES) -> ResultDiff:
-    """Compare two results run by run; files of the same bytes are not opened. `rules`: what may differ.
+    """Compare two results run by run; files of the same bytes are not opened.
 
     Hazards of the same solution and class at most `HAZARD_WINDOW_S` apart are the same hazard.
+
+    Args:
+        out_a: the first result.
+        out_b: the second one.
+        rules: what may differ.
+
+    Returns:
+        Runs that only one of them has, and the differences of the others.
     """
     runs_a, runs_b = (store.complete_runs(out) for out in (out_a, out_b))
     common = [run for run in runs_a if run in set(runs_b)]
@@ -155,6 +166,7 @@ def _section(title: str, rows: list[tuple[str, str]], detail: bool) -> list[str]
 
 
 def _diff_run(out_a: Address, out_b: Address, run_id: str, rules: Rules) -> RunDiff:
+    """What differs between two results of one run."""
     hazards: list[HazardChange] = []
     differences: list[Difference] = []
     verdicts: tuple[str, ...] = ()
@@ -244,6 +256,7 @@ def _recorded(out: Address, table: str, run_id: str) -> bytes | pl.DataFrame:
 
 
 def _frame(out: Address, table: str, run_id: str, recorded: bytes | pl.DataFrame) -> pl.DataFrame:
+    """A table of a run, in whatever form it was recorded."""
     try:
         return read_parquet(recorded) if isinstance(recorded, bytes) else recorded
     except ParquetError as error:
@@ -251,5 +264,6 @@ def _frame(out: Address, table: str, run_id: str, recorded: bytes | pl.DataFrame
 
 
 def _unreadable(out: Address, table: str, run_id: str, reason: str) -> UsageError:
+    """The error for a table that cannot be read."""
     place = redacted(str(store.table_address(out, table, run_id)))
     return UsageError(reason, place=place, remedy="Replay the run again with --force.")

@@ -64,6 +64,7 @@ def rules_of(tolerances: Iterable[str], ignored: Iterable[str], file: Path | Non
 
 
 def _read(file: Path) -> RulesFile:
+    """A file of rules."""
     try:
         content = file.read_bytes()
     except OSError as error:
@@ -72,6 +73,7 @@ def _read(file: Path) -> RulesFile:
 
 
 def _number(text: str, place: str) -> float:
+    """A number, or a refusal that names its place."""
     try:
         value = float(text)
     except ValueError:

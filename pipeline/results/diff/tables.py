@@ -30,6 +30,7 @@ class Difference:
 
     @property
     def place(self) -> str:
+        """`table.column`, or the table alone."""
         return f"{self.table}.{self.column}" if self.column else self.table
 
     def __str__(self) -> str:
@@ -39,16 +40,26 @@ class Difference:
 def compare_tables(
     a: pl.DataFrame, b: pl.DataFrame, contract: type[dy.Schema], keys: tuple[str, ...] = (), rules: Rules = NO_RULES
 ) -> list[Difference]:
-    """The differences of `b` against `a`; none means the same.
+    """The differences of one table against another.
 
-    Rows are compared as they stand, or by `keys` where given, so that one row more is one
-    difference. A column without a tolerance in rules or contract is compared exactly. NaN, which no
-    table may hold, is always a difference.
+    By `keys`, one row more is one difference. A column without a tolerance in rules or contract is compared exactly.
+    NaN, which no table may hold, is always a difference.
+
+    Args:
+        a: table of the first result.
+        b: table of the second one.
+        contract: schema with the tolerance of each column, in the unit of the column.
+        keys: columns by which rows are paired; empty: as they stand.
+        rules: what may differ.
+
+    Returns:
+        The differences, none where the tables are the same.
     """
     name = contract.__name__.lower()
     a, b = (rules.left(name, frame) for frame in (a, b))
     differences = [Difference(name, "schema", *what) for what in _schema_differences(a, b)]
-    common = [column for column in a.columns if b.schema.get(column) == a.schema[column]]
+    was, became = a.schema, b.schema  # each look at a schema makes the types of all columns anew
+    common = [column for column, dtype in was.items() if became.get(column) == dtype]
     if not set(keys) <= set(common):
         return differences
     if keys:
@@ -67,14 +78,15 @@ def compare_tables(
 
 def _schema_differences(a: pl.DataFrame, b: pl.DataFrame) -> Iterator[tuple[str, str]]:
     """Column, or none where it is about all of them, and what became of it."""
-    both = [column for column in a.columns if column in b.columns]
-    yield from ((column, "column is lost") for column in a.columns if column not in both)
-    yield from ((column, "column is new") for column in b.columns if column not in both)
-    if both != [column for column in b.columns if column in both]:
+    was, became = a.schema, b.schema
+    both = [column for column in was if column in became]
+    yield from ((column, "column is lost") for column in was if column not in became)
+    yield from ((column, "column is new") for column in became if column not in was)
+    if both != [column for column in became if column in was]:
         yield "", "columns stand in another order"
     for column in both:
-        if a.schema[column] != b.schema[column]:
-            yield column, f"{a.schema[column]} became {b.schema[column]}"
+        if was[column] != became[column]:
+            yield column, f"{was[column]} became {became[column]}"
 
 
 def _paired(
@@ -118,6 +130,7 @@ def _values_differ(a: pl.Series, b: pl.Series, tolerance: float) -> tuple[str, i
 
 
 def _text(value: object) -> str:
+    """A value for people."""
     if value is None:
         return "null"
     if isinstance(value, pl.Series):

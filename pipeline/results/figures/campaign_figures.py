@@ -135,8 +135,8 @@ def _shares() -> dict[str, pl.Expr]:
     shares: dict[str, pl.Expr] = {}
     for state in _STATES:
         spent = (pl.col(f"share_{state}").fill_null(0.0) * held).filter(counted).sum()
-        seen = (whole > 0.0) & truth.any() if state in ("p0", "p1") else whole > 0.0
-        shares[f"share_{state}"] = pl.when(seen).then((spent / whole).clip(upper_bound=1.0))
+        known = (whole > 0.0) & truth.any() if state in ("p0", "p1") else whole > 0.0
+        shares[f"share_{state}"] = pl.when(known).then((spent / whole).clip(upper_bound=1.0))
     left = 1.0 - pl.sum_horizontal(share.fill_null(0.0) for share in shares.values())
     unknown = pl.when(whole > 0.0).then(pl.when(left > _ROUNDING).then(left).otherwise(0.0))
     return shares | {"share_unknown": unknown}
@@ -183,6 +183,7 @@ def failures_of(runs: pl.DataFrame) -> pl.DataFrame:
 
 
 def _quantiles(values: pl.Expr, name: str) -> dict[str, pl.Expr]:
+    """Median and 95th percentile."""
     return {
         f"{name}_median_s": values.median(),
         f"{name}_p95_s": values.quantile(0.95, interpolation="linear"),
@@ -193,7 +194,7 @@ def _quantiles(values: pl.Expr, name: str) -> dict[str, pl.Expr]:
 def derived_tables(
     runs: pl.DataFrame, hazards: pl.DataFrame, passages: pl.DataFrame, alarms: pl.DataFrame, config: Configuration
 ) -> dict[str, pl.DataFrame]:
-    """By the name of their file, as in `schemas.campaign`; rows of all runs with their `run_id`, in any order.
+    """Tables by the name of their file, as in `schemas.campaign`; from rows of all runs, in any order.
 
     What has bounds over runs counts no recording twice.
     """

@@ -101,6 +101,7 @@ def campaign_levels(runs: pl.DataFrame, config: Configuration) -> pl.DataFrame:
 
 
 def _faults_per_run(hazards: pl.DataFrame) -> pl.DataFrame:
+    """Number of faults of each run, and how many were missed."""
     missed = pl.col("missed")
     truth = pl.col("with_truth")
     counts = {
@@ -150,7 +151,7 @@ def _counts() -> dict[str, pl.Expr]:
 
 
 def campaign_balises(passages: pl.DataFrame) -> pl.DataFrame:
-    """Per balise and solution: how often accepted, lost or accepted unsafely, with exact bounds.
+    """How often each balise was accepted, lost or accepted unsafely, per solution, with exact bounds.
 
     Deletions and acceptances are shares of the trains that passed; unsafe acceptances are shares of
     the acceptances that a truth judged. `passages`: `with_truth`.
@@ -199,6 +200,7 @@ def campaign_accuracy(passages: pl.DataFrame, config: Configuration) -> pl.DataF
 
 
 def _speed_band() -> pl.Expr:
+    """Band of speed that a row lies in."""
     low = (pl.col("speed_mps") * 3.6 / SPEED_BAND_KMH).floor().cast(pl.Int64) * int(SPEED_BAND_KMH)
     band = pl.format(
         "{}-{}", low.cast(pl.String).str.zfill(3), (low + int(SPEED_BAND_KMH)).cast(pl.String).str.zfill(3)
@@ -207,6 +209,7 @@ def _speed_band() -> pl.Expr:
 
 
 def _accuracy(offers: pl.DataFrame, config: Configuration) -> pl.DataFrame:
+    """Location errors of groups of balises, against the accuracy they state."""
     keys = ["grouped_by", "solution", "group"]
     size = pl.col("location_error_m").abs()
     own_m = pl.col("location_accuracy_m")

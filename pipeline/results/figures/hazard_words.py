@@ -21,6 +21,8 @@ def hazard_words(hazards: pl.DataFrame, passages: pl.DataFrame) -> list[str]:
 
     `passages`: of the same run, for where the balises were that it had accepted.
     """
+    if hazards.is_empty():
+        return []
     faults = hazards.filter(pl.col("caused_by").is_null())
     wrong = _wrong_acceptances(passages)
     ranked = sorted(faults.iter_rows(named=True), key=_badness)
@@ -34,8 +36,8 @@ def withstood(hazards: pl.DataFrame) -> str:
     parts = []
     for (kind,), rows in faults.group_by(kinds, maintain_order=True):
         for (detected,), part in rows.group_by("detected", maintain_order=True):
-            met = _response_words(part, detected=bool(detected))
-            parts.append(f"{part.height} {kind}{'s' * (part.height > 1)}{_sizes(part['size_m'])} {met}")
+            response = _response_words(part, detected=bool(detected))
+            parts.append(f"{part.height} {kind}{'s' * (part.height > 1)}{_sizes(part['size_m'])} {response}")
     return ", ".join(parts)
 
 
@@ -47,7 +49,7 @@ def _sizes(size_m: pl.Series) -> str:
 
 
 def _response_words(rows: pl.DataFrame, *, detected: bool) -> str:
-    """How the LDS met these faults: from the begin of the fault to the block."""
+    """How the LDS responded to these faults: from the begin of the fault to the block."""
     if not detected:
         return _say("withstood")
     took_ns = (rows["t_negated"] - rows["t_onset"]).dt.total_nanoseconds().drop_nulls().to_list()
@@ -55,7 +57,7 @@ def _response_words(rows: pl.DataFrame, *, detected: bool) -> str:
 
 
 def _wrong_acceptances(passages: pl.DataFrame) -> dict[tuple[str, int], Row]:
-    """Of each hazard the wrong acceptance with the largest location error."""
+    """The wrong acceptance of each hazard with the largest location error."""
     wrong = passages.filter(
         (pl.col("status") == PassageStatus.ACCEPTED.value) & (pl.col("judgement") == Judgement.WRONG.value)
     )

@@ -12,7 +12,7 @@ from schemas.frozen import frozen
 
 
 def worst_verdict(verdicts: Iterable[RunVerdict | str | None]) -> RunVerdict | None:
-    """The verdict that heads several; None stands for one that failed, and proves nothing beside others."""
+    """The verdict that heads several; None stands for one that failed, and proves nothing among others."""
     known = {None if verdict is None else RunVerdict(verdict) for verdict in verdicts}
     if RunVerdict.UNSAFE in known:
         return RunVerdict.UNSAFE
@@ -33,6 +33,7 @@ class CampaignHead:
 
     @property
     def word(self) -> str:
+        """The verdict in one word."""
         return word_of(self.verdict)
 
     def counts(self) -> dict[str, int]:
@@ -56,12 +57,12 @@ def head_of(verdicts: Iterable[RunVerdict | None]) -> CampaignHead:
 
 
 def run_verdicts(runs: pl.DataFrame) -> dict[str, RunVerdict | None]:
-    """Each run's verdict, the worst of its solutions, from `runs` with `run_id`."""
+    """Verdict of each run, the worst of its solutions, from `runs` with `run_id`."""
     listed = runs.group_by("run_id").agg(pl.col("verdict").cast(pl.String)).sort("run_id")
     return {run_id: worst_verdict(verdicts) for run_id, verdicts in listed.iter_rows()}
 
 
-def figures_beside(runs: pl.DataFrame) -> Mapping[str, Any]:
+def verdict_figures(runs: pl.DataFrame) -> Mapping[str, Any]:
     """The figures beside a campaign's verdict: sums, availability by moving time, the least margin, and where the
     odometers of its safe runs come from by their declarations.
     """

@@ -8,7 +8,7 @@ from pipeline.stages.run_row.bounds import CONFIDENCE
 
 
 def undetected_spread() -> dict[str, pl.Expr]:
-    """Of the passages of one balise: the larger of both directions, and how far before a physical one may lie."""
+    """The larger of both directions over the passages of one balise; how far before a physical one may lie."""
     larger = pl.max_horizontal("undetected_ahead_m", "undetected_behind_m")
     before = pl.col("physical_before_m")
     return {
@@ -24,7 +24,7 @@ def undetected_spread() -> dict[str, pl.Expr]:
 
 
 def spacing_of_runs() -> dict[str, pl.Expr]:
-    """Of the runs of one solution: the shortest spacing, and the share of all runs that keep it, from below.
+    """The shortest spacing over the runs of one solution, and the share of runs that keep it, from below.
 
     None of n runs fell short of their own shortest: with 95 % confidence, one-sided as of claims (DOMAIN section 6), a
     share of 0.05^(1/n) does not (Clopper and Pearson, n of n).

@@ -41,7 +41,7 @@ def hazard_text(row: Row) -> str:
 
 
 def passage_entries(passages: pl.DataFrame) -> list[Entry]:
-    """Each passage, when the balise was offered, else when it was passed."""
+    """Entries of the passages, at the time the balise was offered, else passed."""
     entries: list[Entry] = []
     for row in _plain(passages):
         t_ns = row["t_offered"] if row["t_offered"] is not None else row["t_true"]

@@ -68,6 +68,7 @@ def balises_geojson(site: Site) -> str:
 
 
 def _track_features(solution: str, epochs: pl.DataFrame, site: Site) -> Iterator[Feature]:
+    """The matched positions of a solution, as lines."""
     states = epochs.select("t", state=pl.col("lds_state").cast(pl.String))
     matched = positions_of(epochs, site).matched.join(states, on="t", how="left", maintain_order="left")
     for part in _stretches(matched):
@@ -105,6 +106,7 @@ def _placed(frame: pl.DataFrame, site: Site) -> Iterator[tuple[dict[str, Any], t
 
 
 def _point(kind: str, row: Mapping[str, Any], ground: tuple[float, float, float]) -> Feature:
+    """A point of the map, with its properties."""
     plain = {name: _utc(value) if isinstance(value, datetime) else value for name, value in row.items()}
     named = {"kind_of_balise" if name == "kind" else name: value for name, value in plain.items()}
     return _feature("Point", _place(*ground), {"kind": kind, **named})
@@ -116,6 +118,7 @@ def _feature(kind: str, coordinates: list[Any], properties: dict[str, Any]) -> F
 
 
 def _collection(features: list[Feature]) -> str:
+    """Features in one GeoJSON document."""
     document = {"type": "FeatureCollection", "features": features}
     return json.dumps(document, separators=(",", ":"), ensure_ascii=False, allow_nan=False)
 
@@ -127,6 +130,7 @@ def _place(latitude: float, longitude: float, height: float | None) -> list[floa
 
 
 def _gpx_points(part: pl.DataFrame) -> Iterator[str]:
+    """Points of a GPX track."""
     for t, latitude, longitude, height in part.select("t", "latitude_deg", "longitude_deg", "height_m").iter_rows():
         elevation = "" if height is None else f"<ele>{height:.3f}</ele>"
         yield f"<trkpt {_lat_lon(latitude, longitude)}>{elevation}<time>{_utc(t)}</time></trkpt>\n"
@@ -137,4 +141,5 @@ def _lat_lon(latitude: float, longitude: float) -> str:
 
 
 def _utc(t: datetime) -> str:
+    """A time in ISO 8601, in UTC."""
     return t.astimezone(UTC).isoformat(timespec="milliseconds").replace("+00:00", "Z")

@@ -26,11 +26,12 @@ _WRITTEN = "2014-02-10T00:00:00Z"
 
 
 def layers_of(tables: RunTables, site: Site) -> dict[str, pl.DataFrame]:
-    """Each table with `run_id` in front and its place on the rails as `geometry`, null where it is not known."""
+    """Tables with `run_id` in front and the place on the rails as `geometry`, null where it is not known."""
     return {name: _with_geometry(getattr(tables, name), tables.run_id, site) for name in LAYERS}
 
 
 def _with_geometry(frame: pl.DataFrame, run_id: str, site: Site) -> pl.DataFrame:
+    """A table with the point of each row, as well-known binary."""
     measure_m = frame["measure_m"].fill_null(float("nan")).to_numpy()
     ground = ground_of(site.track, frame["netelement_id"], measure_m)
     points = np.zeros(frame.height, _WKB_POINT)
@@ -76,7 +77,7 @@ def geopackage_bytes(layers: Mapping[str, pl.DataFrame], place: Path) -> bytes:
 
 
 def _plain(layer: pl.DataFrame) -> pl.DataFrame:
-    """With the types that a GeoPackage has."""
+    """The table with the types that a GeoPackage has."""
     lists = [name for name, kind in layer.schema.items() if isinstance(kind, pl.List)]
     enums = [name for name, kind in layer.schema.items() if isinstance(kind, pl.Enum)]
     times = [name for name, kind in layer.schema.items() if isinstance(kind, pl.Datetime)]

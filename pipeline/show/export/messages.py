@@ -131,6 +131,7 @@ def message_class(name: str, fields: Fields) -> Any:
 
 
 def _add_field(message: Any, name: str, number: int, field: str, kind: str) -> None:
+    """Add a field to a description of messages."""
     from google.protobuf.descriptor_pb2 import FieldDescriptorProto
 
     def add(kind: str, **more: Any) -> None:
@@ -158,6 +159,7 @@ def _add_field(message: Any, name: str, number: int, field: str, kind: str) -> N
 
 
 def _kind(dtype: pl.DataType) -> str:
+    """Kind of a field, of the type of its column."""
     if isinstance(dtype, pl.Datetime):
         return "time"
     if dtype == pl.Boolean:
@@ -168,11 +170,13 @@ def _kind(dtype: pl.DataType) -> str:
 
 
 def _message(name: str, fields: Fields, values: Mapping[str, Any]) -> bytes:
+    """A message in protobuf's encoding."""
     times = {field: _stamp(values[field]) for field, kind in fields if kind == "time"}
     return bytes(message_class(name, fields)(**{**values, **times}).SerializeToString(deterministic=True))
 
 
 def _stamp(t_ns: int | None) -> dict[str, int] | None:
+    """Seconds and nanoseconds of a time."""
     return None if t_ns is None else dict(zip(("seconds", "nanos"), divmod(t_ns, NS_PER_S), strict=True))
 
 
@@ -215,6 +219,7 @@ def cdr_messages(fields: Fields, rows: Iterator[Mapping[str, Any]]) -> Iterator[
 
 
 def _append(content: bytearray, kind: str, value: Any) -> None:
+    """Append a value in the encoding of CDR."""
     if kind == "time":
         seconds, rest = divmod(value, NS_PER_S)
         content += bytes(-len(content) % 4) + struct.pack("<iI", seconds, rest)

@@ -74,7 +74,7 @@ def navsatfix_topic(topic: str, gnss: pl.DataFrame, frame_id: str) -> Topic:
 
 
 def _with_covariance(gnss: pl.DataFrame, frame_id: str) -> pl.DataFrame:
-    """With the covariance, row by row of the matrix [m2], and its type; zeros where it is not known. Times in ns."""
+    """Rows with the covariance, row by row of the matrix [m2], and its type; zeros where unknown. Times in ns."""
     known = pl.all_horizontal(pl.col(name).is_not_null() for name in _COVARIANCE)
     places = zip(_PLACES, _COVARIANCE, strict=True)
     return gnss.with_columns(

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import polars as pl
 
-from pipeline.results.places import GroundPositions, beside, ground_of, sign_of, stretches_of
+from pipeline.results.places import GroundPositions, ground_of, offset_positions, sign_of, stretches_of
 from schemas.arrays import floats
 from schemas.config import HazardConfig
 from schemas.frozen import frozen
@@ -33,7 +33,7 @@ def positions_of(epochs: pl.DataFrame, site: Site) -> ExportedPositions:
     column = {name: floats(epochs, name) for name in _NEEDED}
     rails = ground_of(site.track, epochs["netelement_id"], column["measure_m"])
     sign = sign_of(epochs, stretches_of(epochs))
-    gnss = beside(rails, sign, column["cross_track_m"], column["vertical_m"])
+    gnss = offset_positions(rails, sign, column["cross_track_m"], column["vertical_m"])
     low_m = column["true_measure_low_m"]
     high_m = column["true_measure_high_m"]
     middle_m = np.where(high_m - low_m <= 2.0 * HazardConfig().known_error_m, 0.5 * (low_m + high_m), np.nan)

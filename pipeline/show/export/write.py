@@ -27,12 +27,26 @@ def export_run(
     log: RunLog | None = None,
     positions: PositionMessage = "foxglove",
 ) -> tuple[list[Path], list[str]]:
-    """Write a run of the result `out`; returns the files, and what they lack for want of site or log.
+    """Write a run of a result for viewers and GIS.
 
-    `.mcap` holds raw (from the log), GNSS, matched and true positions, track, balises, monitors, LDS, hazards
-    and passages; beside it goes `NAME.layout.json` for Foxglove. `positions` chooses foxglove.LocationFix or
-    ROS 2 NavSatFix. The others need the site. `.geojson` and `.gpx` hold matched positions and hazards, `.gpkg` and
-    `.parquet` epochs, passages and hazards with all their columns; GeoParquet has a file for each table.
+    `.mcap` holds raw (from the log), GNSS, matched and true positions, track, balises, monitors, LDS, hazards and
+    passages; next to it goes `NAME.layout.json` for Foxglove. The others need the site. `.geojson` and `.gpx` hold
+    matched positions and hazards, `.gpkg` and `.parquet` epochs, passages and hazards with all their columns;
+    GeoParquet has a file for each table.
+
+    Args:
+        out: the result.
+        run_id: id of the run.
+        to: the file; its suffix chooses the format.
+        site: the site of the result, for places on the ground.
+        log: the recorded run, for raw messages.
+        positions: MCAP messages of positions: foxglove.LocationFix or ROS 2 NavSatFix.
+
+    Returns:
+        The files, and what they lack for want of site or log.
+
+    Raises:
+        UsageError: the suffix is unknown, or the format needs the site.
     """
     if to.suffix.lower() not in SUFFIXES:
         raise UsageError("has an unknown suffix", place=str(to), expected=" or ".join(SUFFIXES))
@@ -78,7 +92,7 @@ def _write_mcap(
 
 
 def _write_geoparquet(tables: RunTables, to: Path, site: Site) -> list[Path]:
-    """A file holds one table: epochs under the name asked for, the others beside it."""
+    """Write a file per table: epochs under the name asked for, the others next to it."""
     files = []
     for name, layer in layers_of(tables, site).items():
         files.append(to if name == "epochs" else to.with_suffix(f".{name}.parquet"))

@@ -7,7 +7,7 @@ from typing import Any
 
 import polars as pl
 
-from pipeline.results.figures.head import figures_beside, head_of, run_verdicts, word_of
+from pipeline.results.figures.head import head_of, run_verdicts, verdict_figures, word_of
 from pipeline.results.figures.known_counts import HAZARD_COUNTS, known_counts
 from pipeline.results.query import run_sql
 from pipeline.results.store import read_config, read_table
@@ -33,14 +33,14 @@ _COUNTED = ("faults", "missed_detections", *HAZARD_COUNTS, "failures", "failures
 _LARGEST = ("time_to_detect_max_s", "time_since_failure_max_s", "hazardous_max_s", "location_error_max_m")
 _SUMMED = ("balises_found", "balises_passed", "alarms", "false_alarms", "outages")
 # What of a run has to change for its row.
-_TOLD = ("verdict", "availability", "balises_found", *_COUNTED, "time_to_detect_max_s")
+_COMPARED = ("verdict", "availability", "balises_found", *_COUNTED, "time_to_detect_max_s")
 # Half a percent of the time is a change that somebody should see.
 _AVAILABILITY = 0.005
 _PLACES = 20
 
 
 def against_page(out: Address, other: Address) -> str:
-    """The page of `out` beside `other`, over the runs that both have. Raises `UsageError` where there are none."""
+    """The page of `out` and `other`, over the runs that both have. Raises `UsageError` where there are none."""
     this, that = (read_table(of, "runs").collect() for of in (out, other))
     both = this.join(that, on=_RUN, how="semi").select(_RUN)
     if both.is_empty():
@@ -127,11 +127,11 @@ def _names() -> Sequence[str]:
 
 
 def _figures_of(runs: pl.DataFrame) -> list[float | None]:
-    """By `_names`; null where no run knows it."""
-    beside = figures_beside(runs)
+    """Values of the figures in `_names`; null where no run knows it."""
+    figures = verdict_figures(runs)
     sums = {name: runs[name].sum() if runs[name].count() else None for name in (*_SUMMED, *_COUNTED, "hazardous_s")}
     most = {name: runs[name].max() for name in _LARGEST}
-    known = {**{name: beside[name] for name in ("availability", "proof_margin_m")}, **sums, **most}
+    known = {**{name: figures[name] for name in ("availability", "proof_margin_m")}, **sums, **most}
     return [known[name] for name in _names()]
 
 
@@ -144,21 +144,21 @@ def _value(name: str, value: float | None) -> Cell:
 
 
 def _changed_runs(runs: pl.DataFrame, of_other: pl.DataFrame) -> str:
-    here = runs.select(*_RUN, *_TOLD).with_columns(pl.col("verdict").cast(pl.String))
-    there = of_other.select(*_RUN, *_TOLD).with_columns(pl.col("verdict").cast(pl.String))
+    here = runs.select(*_RUN, *_COMPARED).with_columns(pl.col("verdict").cast(pl.String))
+    there = of_other.select(*_RUN, *_COMPARED).with_columns(pl.col("verdict").cast(pl.String))
     pairs_of = there.join(here, on=_RUN, suffix="_now")
     step = (pl.col("availability_now") - pl.col("availability")).abs()
     known = pl.col("availability").is_null() != pl.col("availability_now").is_null()
-    exact = [pl.col(name).ne_missing(pl.col(f"{name}_now")) for name in _TOLD if name != "availability"]
+    exact = [pl.col(name).ne_missing(pl.col(f"{name}_now")) for name in _COMPARED if name != "availability"]
     changed = pairs_of.filter(pl.any_horizontal(*exact, known, (step > _AVAILABILITY).fill_null(value=False)))
     if changed.is_empty():
         return "<p>None: verdicts, availability, balises, faults and times to detect are the same.</p>"
     shown = changed.sort(step, descending=True, nulls_last=True)
     rows = [
-        [*(cell(row[name]) for name in _RUN), *(_became(row, name) for name in _TOLD)]
+        [*(cell(row[name]) for name in _RUN), *(_became(row, name) for name in _COMPARED)]
         for row in shown.iter_rows(named=True)
     ]
-    heads = [(title(name), "") for name in (*_RUN, *_TOLD)]
+    heads = [(title(name), "") for name in (*_RUN, *_COMPARED)]
     return table("table-changed", "Runs that changed: there → here", heads, rows)
 
 

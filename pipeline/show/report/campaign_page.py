@@ -99,9 +99,11 @@ def campaign_page(campaign: Campaign, made: Made) -> str:
         "limits": {"failure_limit_m": made.config.hazards.failure_limit_m},
     }
     href = campaign.hrefs.get(named or "", "")
-    way = f'<p class="ways">{link(href, f"Open run {named}")}</p>' if href else ""
+    link_to_run = f'<p class="ways">{link(href, f"Open run {named}")}</p>' if href else ""
     count = plural(campaign.runs["run_id"].n_unique(), "run")
-    heading = verdict_head(head.word, head.worst, head.reasons, head.beside) + way + f"<h1>Campaign of {count}</h1>"
+    heading = (
+        verdict_head(head.word, head.worst, head.reasons, head.figures) + link_to_run + f"<h1>Campaign of {count}</h1>"
+    )
     foot = ", ".join(campaign.runs["software"].unique().sort().to_list())
     title = f"Campaign · balise: {head.word}"
     return page(title, heading, "\n".join(body), script_json(data), "campaign.js", foot)
@@ -169,13 +171,13 @@ def _runs_table(campaign: Campaign) -> str:
 
 
 def _accepted(row: Row) -> Cell:
-    """Of the balises on the path."""
+    """How many of the balises on the path were accepted."""
     found = row["balises_found"]
     return Cell(UNKNOWN) if found is None else Cell("".join(accepted_words(row)), float(found))
 
 
 def _notes(row: Row) -> Cell:
-    """Folded: some are longer than all that stands beside them."""
+    """The notes, folded: some are longer than all around them."""
     notes = notes_apart(row["notes"])
     items = "".join(f"<p>{escape(note)}</p>" for note in notes)
     summary = plural(len(notes), "note")
@@ -183,7 +185,7 @@ def _notes(row: Row) -> Cell:
 
 
 def _whys(campaign: Campaign) -> dict[tuple[str, str], str]:
-    """Per run and solution what is wrong with it, in a few words; nothing where it is safe."""
+    """What is wrong with each run and solution, in a few words; nothing where it is safe."""
     faults = campaign.hazards.partition_by("run_id", as_dict=True)
     offers = campaign.passages.filter(pl.col("hazard_id").is_not_null()).partition_by("run_id", as_dict=True)
     whys = {}

@@ -36,7 +36,7 @@ def frame_table(
     contract: type[dy.Schema] | None = None,
     special: Special | None = None,
 ) -> str:
-    """A frame as a table; `names`: all columns unless said otherwise. Bounds stand beside their figure."""
+    """A frame as a table; `names`: all columns unless said otherwise. Bounds are next to their figure."""
     special = special or {}
     shown = list(names) or _figure_names(frame.columns)
     bounds = bounds_of(frame.columns)
@@ -63,8 +63,8 @@ def figures(identity: str, caption: str, row: Row, contract: type[dy.Schema]) ->
 
 def _figure_names(names: Collection[str]) -> list[str]:
     """The columns that are no bounds of others."""
-    beside = {bound for pair in bounds_of(names).values() for bound in pair}
-    return [name for name in names if name not in beside]
+    bounds = {bound for pair in bounds_of(names).values() for bound in pair}
+    return [name for name in names if name not in bounds]
 
 
 def _meanings(contract: type[dy.Schema] | None) -> dict[str, str]:

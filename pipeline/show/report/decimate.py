@@ -33,13 +33,14 @@ def kept_rows(values: Floats, whole: Bools, bins: int = BINS) -> Ints:
 
 
 def worst_rows(codes: Ints, stride: int) -> Ints:
-    """Of every so many rows the first with the largest code: what is bad is not left out."""
+    """The first row with the largest code of every so many: what is bad is not left out."""
     edges = np.append(np.arange(0, len(codes), stride), len(codes))
     return _extreme_rows(codes.astype(np.float64), edges, np.maximum)
 
 
 def _extreme_rows(values: Floats, edges: Ints, extreme: np.ufunc) -> Ints:
     """The first row of each bin that holds the bin's extreme."""
+    # Rows at the extreme of their bin; all others lie behind the last row.
     peaks = extreme.reduceat(values, edges[:-1])
     at_peak = values == np.repeat(peaks, np.diff(edges))
     rows = np.where(at_peak, np.arange(len(values)), len(values))
@@ -47,7 +48,7 @@ def _extreme_rows(values: Floats, edges: Ints, extreme: np.ufunc) -> Ints:
 
 
 def _edges_of(known: Bools, edges: Ints) -> Ints:
-    """Per bin the first and last change between known and unknown, both sides of it."""
+    """First and last change between known and unknown in each bin, both sides of it."""
     changes = np.flatnonzero(np.diff(known)) + 1
     if not len(changes):
         return np.array([], dtype=np.int64)
@@ -102,14 +103,16 @@ def band(t_ms: Ints, codes: Ints, hold_ms: int, gap_code: int, pieces: int = 300
 
 
 def _merge_equal(starts: Ints, codes: Ints) -> tuple[Ints, Ints]:
+    """Neighbouring pieces of one state made one."""
     first = np.flatnonzero(np.diff(codes, prepend=-1))
     return starts[first], codes[first]
 
 
 def _worst(starts: Ints, codes: Ints, edges: Ints) -> tuple[Ints, Ints]:
-    """Each bin with the worst of the pieces that reach into it."""
+    """Bins, each with the worst of the pieces that reach into it."""
     first = np.searchsorted(starts, edges, side="right") - 1
     last = np.append(np.searchsorted(starts, edges[1:], side="left"), len(starts))
+    # `reduceat` goes from each bound to the next: every other of its values is of a bin.
     bounds = np.column_stack([first, last]).ravel()
     padded = np.append(codes, -1)
     return edges, np.maximum.reduceat(padded, bounds)[::2]

@@ -11,10 +11,10 @@ import numpy as np
 import polars as pl
 
 from pipeline.results.places import (
-    beside,
     element_lines_m,
     ground_at,
     ground_of,
+    offset_positions,
     origin_of,
     plane_m,
     sign_of,
@@ -44,17 +44,19 @@ class _View:
     origin: tuple[float, float]
 
     def at(self, path_m: Floats) -> tuple[Floats, Floats]:
+        """East and north [m] of path positions; without a site the path is drawn straight."""
         if self.site is None:
             return path_m, np.where(np.isfinite(path_m), 0.0, np.nan)
         return plane_m(ground_at(self.site.track, self.stretches, path_m), self.origin)
 
     def gnss(self, epochs: pl.DataFrame) -> tuple[Floats, Floats]:
+        """East and north [m] of the positions themselves, off the track as far as they were."""
         cross_m = floats(epochs, "cross_track_m")
         if self.site is None:
             return floats(epochs, "path_m"), cross_m
         rails = ground_of(self.site.track, epochs["netelement_id"], floats(epochs, "measure_m"))
         sign = sign_of(epochs, self.stretches)
-        return plane_m(beside(rails, sign, cross_m, np.zeros(len(cross_m))), self.origin)
+        return plane_m(offset_positions(rails, sign, cross_m, np.zeros(len(cross_m))), self.origin)
 
 
 def plan_data(epochs: pl.DataFrame, passages: pl.DataFrame, site: Site | None, moments_ns: Ints) -> Json:
@@ -80,7 +82,7 @@ def plan_data(epochs: pl.DataFrame, passages: pl.DataFrame, site: Site | None, m
 
 
 def _shown_rows(t_ns: Ints, codes: Ints, moments_ns: Ints) -> Ints:
-    """So many rows at even distances, the worst in between, and all near the moments that matter."""
+    """At most so many rows at even distances, the worst in between, and all near the moments that matter."""
     stride = -(-len(t_ns) // _POINTS)
     if stride <= 1:
         return np.arange(len(t_ns))
@@ -125,7 +127,7 @@ def _balises(view: _View, passages: pl.DataFrame) -> list[Json]:
         {
             "id": row["balise_id"],
             "outcome": OUTCOMES[row["worst"]],
-            "outcomes": ", ".join(sorted(f"{met['count']} {met['outcome']}" for met in row["outcomes"])),
+            "outcomes": ", ".join(sorted(f"{entry['count']} {entry['outcome']}" for entry in row["outcomes"])),
             "place": f"{row['netelement_id']} at {row['measure_m']:.1f} m",
             "x": _rounded(x[number]),
             "y": _rounded(y[number]),
@@ -149,7 +151,7 @@ PIECE_COLUMNS = ("solution", "netelement_id", "measure_m", "moving", "tvb", "ala
 
 
 def availability_pieces(epochs: pl.LazyFrame) -> pl.DataFrame:
-    """Per solution, net element and piece of it: epochs while moving, those with a valid TVB, alarms.
+    """Epochs while moving, those with a valid TVB, and alarms, per solution, net element and piece of it.
 
     Where nobody knows whether the train moved, the epoch counts, and its TVB does not; `known` counts the others.
 
@@ -191,10 +193,12 @@ def _step_m(extents: pl.DataFrame) -> float:
 
 
 def _piece_m(measure_m: pl.Expr, step_m: float) -> pl.Expr:
+    """Begin of the piece that a measure lies in [m]."""
     return (measure_m / step_m).floor() * step_m
 
 
 def _of_length(pieces: pl.DataFrame, step_m: float) -> pl.DataFrame:
+    """Pieces with their ends."""
     return pieces.with_columns(to_m=pl.col("from_m") + step_m).sort(_PLACE)
 
 
@@ -216,7 +220,7 @@ def availability_map(pieces: pl.DataFrame, hazards: pl.DataFrame, site: Site | N
 
 
 def _places(names: pl.Series, measure_m: Floats, elements: list[str], site: Site | None) -> tuple[Floats, Floats]:
-    """Where measures on net elements are drawn."""
+    """Places where measures on net elements are drawn."""
     if site is None:
         return measure_m, np.array([float(elements.index(name)) for name in names])
     return plane_m(ground_of(site.track, names, measure_m), origin_of(site))
@@ -234,7 +238,7 @@ def _hazards(hazards: pl.DataFrame, elements: list[str], site: Site | None) -> l
 
 
 def _pieces(pieces: pl.DataFrame, elements: list[str], site: Site | None) -> list[Json]:
-    """Each piece as a line; on the ground through five points, none beyond the ends of its element."""
+    """Lines of the pieces; on the ground through five points, none beyond the ends of its element."""
     points = 2 if site is None else 5
     measure_m = np.linspace(pieces["from_m"], pieces["to_m"], points, axis=1)
     if site is not None:

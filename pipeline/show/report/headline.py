@@ -8,14 +8,14 @@ from collections.abc import Iterable, Mapping, Sequence
 import polars as pl
 
 from pipeline.results.figures.hazard_words import hazard_words, withstood
-from pipeline.results.figures.head import figures_beside, head_of, run_verdicts, word_of, worst_verdict
+from pipeline.results.figures.head import head_of, run_verdicts, verdict_figures, word_of, worst_verdict
 from pipeline.show.report.columns import Row
 from pipeline.show.report.markup import Cell, cell, number, table
 from pipeline.show.report.words import WORDS, plural, some_of
 from schemas.enums import Origin, Reason, RunVerdict
 from schemas.frozen import frozen
 from schemas.run import RunTables
-from schemas.words import beside_words, part_words, reason_words, say, unnoticed_words
+from schemas.words import JUDGES, part_words, reason_words, say, unnoticed_words, verdict_figures_words
 
 _ALL_SAFE = "every acceptance right, every position failure within the time allowed, in all runs"
 
@@ -27,11 +27,11 @@ class Headline:
     word: str
     worst: str
     reasons: str
-    beside: str = ""
+    figures: str = ""
 
 
 def run_headline(rows: Iterable[Row], hazards: pl.DataFrame, passages: pl.DataFrame) -> Headline:
-    """Of one run with all its solutions, headed by the worst of them."""
+    """Headline of one run with all its solutions, headed by the worst of them."""
     listed = list(rows)
     verdict = worst_verdict(row["verdict"] for row in listed)
     heading = next((row for row in listed if row["verdict"] == verdict), listed[0])
@@ -39,12 +39,12 @@ def run_headline(rows: Iterable[Row], hazards: pl.DataFrame, passages: pl.DataFr
         return Headline(word_of(verdict), heading["error"] or "the run failed", "")
     worst = _worst(heading, hazards, passages)
     proved = _withstands(heading) if verdict == RunVerdict.SAFE else ""
-    beside = _sentences(beside_words(heading), part_words(heading), proved)
+    figures = _sentences(verdict_figures_words(heading), part_words(heading), proved)
     if len(listed) > 1:
         reasons = " ".join(_of_solution(row) for row in listed)
-        return Headline(word_of(verdict), f"{heading['solution']}: {worst}", reasons, beside)
+        return Headline(word_of(verdict), f"{heading['solution']}: {worst}", reasons, figures)
     reasons = f"{reason_words(heading)}." if verdict == RunVerdict.UNSAFE else ""
-    return Headline(word_of(verdict), worst, reasons, beside)
+    return Headline(word_of(verdict), worst, reasons, figures)
 
 
 def _sentences(*texts: str) -> str:
@@ -61,7 +61,7 @@ def _withstands(run: Row) -> str:
 
 
 def _of_solution(row: Row) -> str:
-    why = "" if row["verdict"] is None else f", {reason_words(row)}, {beside_words(row)}"
+    why = "" if row["verdict"] is None else f", {reason_words(row)}, {verdict_figures_words(row)}"
     return f"{row['solution']}: {word_of(row['verdict'])}{why}."
 
 
@@ -72,8 +72,8 @@ def _worst(run: Row, hazards: pl.DataFrame, passages: pl.DataFrame) -> str:
     """
     of_solution = pl.col("solution") == run["solution"]
     if run["verdict"] == RunVerdict.SAFE:
-        met = withstood(hazards.filter(of_solution))
-        return met or f"{reason_words(run)}; {say('verdicts', 'no_fault')}"
+        withstood_words = withstood(hazards.filter(of_solution))
+        return withstood_words or f"{reason_words(run)}; {say('verdicts', 'no_fault')}"
     accepted = pl.col("accepted_ids").list.len() > 0
     late = pl.col("within_budget").eq(other=False)
     guilty = hazards.filter(of_solution, accepted | late)
@@ -81,28 +81,28 @@ def _worst(run: Row, hazards: pl.DataFrame, passages: pl.DataFrame) -> str:
 
 
 def campaign_headline(runs: pl.DataFrame, hazards: pl.DataFrame, passages: pl.DataFrame) -> tuple[Headline, str | None]:
-    """Of all runs, and the run that it names; frames with `run_id`."""
+    """Headline of all runs, and the run that it names; frames with `run_id`."""
     head = head_of(run_verdicts(runs).values())
     total = sum(head.counts().values())
     counts = ", ".join(f"{count} {name}" for name, count in head.counts().items() if count)
     summary = f"{plural(total, 'run')}: {counts}."
     if head.verdict is None:
         return Headline(head.word, "no run could be replayed", summary), None
-    beside = beside_words(figures_beside(runs))
+    figures = verdict_figures_words(verdict_figures(runs))
     if head.verdict == RunVerdict.SAFE:
-        met = withstood(hazards) or say("verdicts", "no_fault")
+        withstood_words = withstood(hazards) or say("verdicts", "no_fault")
         largest_m = None if runs["undetected_max_m"].has_nulls() else float(runs["undetected_max_m"].max())  # type: ignore[arg-type]
-        proved = _sentences(beside, unnoticed_words(largest_m))
-        return Headline(head.word, f"{_ALL_SAFE}; {met}", summary, proved), None
+        proved = _sentences(figures, unnoticed_words(largest_m))
+        return Headline(head.word, f"{_ALL_SAFE}; {withstood_words}", summary, proved), None
     rows = runs.filter(pl.col("verdict") == head.verdict.value)
     order = ("unsafe_accepted", "hazardous_max_s", "unproven_accepted", "share_unknown")
     worst = rows.sort(*order, "run_id", descending=[True] * len(order) + [False], nulls_last=True).head(1)
     if worst.is_empty():
-        return Headline(head.word, f"{plural(head.failed, 'run')} failed, the others are safe", summary, beside), None
+        return Headline(head.word, f"{plural(head.failed, 'run')} failed, the others are safe", summary, figures), None
     row = worst.row(0, named=True)
     of_run = pl.col("run_id") == row["run_id"]
     reason = _worst(row, hazards.filter(of_run), passages.filter(of_run))
-    return Headline(head.word, f"{reason} (run {row['run_id']})", summary, beside), row["run_id"]
+    return Headline(head.word, f"{reason} (run {row['run_id']})", summary, figures), row["run_id"]
 
 
 _TRAINS = {
@@ -117,7 +117,6 @@ _COUNTED = (
     ("faults not found in time", "missed_detections", "bad"),
     ("accepted, could not be checked", "unproven_accepted", "doubt"),
 )
-JUDGES = {"reference": "a reference", "balise": "balise reads", "odometer": "the odometer alone"}
 
 
 def facts(rows: Sequence[Row], tables: RunTables, metadata: Mapping[str, str]) -> list[tuple[str, str]]:
@@ -142,7 +141,7 @@ def facts(rows: Sequence[Row], tables: RunTables, metadata: Mapping[str, str]) -
 
 
 def _odometer(row: Row) -> str:
-    """Where it comes from, and that this is a declaration; nothing without one."""
+    """Origin of the odometer, and that this is a declaration; nothing without one."""
     origin = row["odometer_origin"]
     if origin is None:
         return ""

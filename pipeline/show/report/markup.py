@@ -118,6 +118,7 @@ def tiles(rows: Iterable[tuple[str, str, str]]) -> str:
 
 
 def section(identity: str, title: str, *content: str) -> str:
+    """A section of a page with its heading."""
     inner = "\n".join(part for part in content if part)
     return f'<section id="{identity}"><h2>{escape(title)}</h2>\n{inner}\n</section>'
 
@@ -132,12 +133,13 @@ def figure(name: str, title: str, explanation: str = "") -> str:
 
 
 def badge(kind: str, text: str = "") -> str:
+    """A coloured word."""
     return f'<span class="badge {escape(kind)}">{escape(text or kind)}</span>'
 
 
-def verdict_head(word: str, worst: str, reasons: str = "", beside: str = "") -> str:
+def verdict_head(word: str, worst: str, reasons: str = "", figures_text: str = "") -> str:
     """The verdict as the first sentence of a page, coloured by it, and what speaks for it."""
-    figures = f"<br>{escape(beside[0].upper() + beside[1:])}." if beside else ""
+    figures = f"<br>{escape(figures_text[0].upper() + figures_text[1:])}." if figures_text else ""
     why = f"<br><small>{escape(reasons)}</small>" if reasons else ""
     return f'<p class="verdict {escape(word)}"><strong>{escape(word)}</strong>: {escape(worst)}.{figures}{why}</p>'
 
@@ -148,7 +150,7 @@ def page(title: str, heading: str, body: str, data: str, script: str, foot: str)
     `title` and `foot` stand on each sheet of paper.
     """
     shared = _text("report.css")
-    printed = _sheets(title, foot)
+    printed = _printed_pages(title, foot)
     code = _code(script)
     policy = (
         f"default-src 'none'; script-src {_digest(code)}; style-src {_digest(shared)} {_digest(printed)}; "
@@ -174,7 +176,7 @@ def _digest(content: str) -> str:
     return f"'sha256-{base64.b64encode(hashlib.sha256(content.encode()).digest()).decode()}'"
 
 
-def _sheets(head: str, foot: str) -> str:
+def _printed_pages(head: str, foot: str) -> str:
     """What stands at the top and the bottom of each sheet of paper."""
     return (
         f"@page {{ @top-left {{ content: {_css_text(head)}; }} @bottom-left {{ content: {_css_text(foot)}; }}"

@@ -34,8 +34,8 @@ def found_route(epochs: pl.DataFrame) -> pl.DataFrame | None:
 
     `doubtful`: the track was, at the time or in hindsight; the least probabilities of both stand beside it.
     """
-    ways = stretches_of(epochs)
-    if ways.is_empty() or ways["netelement_id"].n_unique() < ways.height:
+    stretches = stretches_of(epochs)
+    if stretches.is_empty() or stretches["netelement_id"].n_unique() < stretches.height:
         return None
     of_elements = (
         epochs.filter(pl.col("path_m").is_not_null())
@@ -48,7 +48,7 @@ def found_route(epochs: pl.DataFrame) -> pl.DataFrame | None:
         )
     )
     return (
-        ways.join(of_elements, on="netelement_id", how="left")
+        stretches.join(of_elements, on="netelement_id", how="left")
         .sort("first_m")
         .select(
             "netelement_id",

@@ -15,7 +15,7 @@ from pipeline.results.places import origin_of
 from pipeline.show.report.balises import architectures_section, balise_table, lost_shares, outcome
 from pipeline.show.report.columns import Row, figures, frame_table
 from pipeline.show.report.ground import plan_data
-from pipeline.show.report.headline import FILES, JUDGES, facts, file_table, run_headline, tile_figures
+from pipeline.show.report.headline import FILES, facts, file_table, run_headline, tile_figures
 from pipeline.show.report.markup import (
     Cell,
     Json,
@@ -38,7 +38,7 @@ from schemas.enums import TRUTH
 from schemas.frozen import frozen
 from schemas.run import RunTables, Site
 from schemas.tables import Alarms, Hazards, Passages, Runs
-from schemas.words import notes_apart
+from schemas.words import JUDGES, notes_apart
 
 # The first ten are shown, the others behind a switch.
 _HAZARDS = (
@@ -93,7 +93,7 @@ def run_page(
     about = pairs(facts(rows, tables, metadata))
     digests = pairs(sorted((name, value) for name, value in metadata.items() if not name.endswith(FILES)))
     provenance = section("provenance", "Provenance", file_table(metadata), digests, configuration(made))
-    body = "\n".join([about, _navigation(names), *parts, side_by_side, provenance])
+    body = "\n".join([about, _contents(names), *parts, side_by_side, provenance])
     hazards = made.config.hazards
     data = {
         "run": tables.run_id,
@@ -109,20 +109,20 @@ def run_page(
         "solutions": {name: _solution_data(name, tables, made) for name in names},
     }
     head = run_headline(rows, tables.hazards, tables.passages)
-    verdict = verdict_head(head.word, head.worst, head.reasons, head.beside)
-    ways = _ways(neighbours)
-    heading = f"{verdict}{ways}<h1>Run {escape(tables.run_id)}</h1>"
+    verdict = verdict_head(head.word, head.worst, head.reasons, head.figures)
+    links = _navigation(neighbours)
+    heading = f"{verdict}{links}<h1>Run {escape(tables.run_id)}</h1>"
     foot = f"{rows[0]['software']}, log and site {rows[0]['input_digest'][:12]}"
     return page(f"{tables.run_id} · balise: {head.word}", heading, body, script_json(data), "run.js", foot)
 
 
-def _ways(neighbours: Neighbours) -> str:
-    """To the campaign, and to the runs beside this one."""
-    ways = [link("../index.html", "Campaign", data_go="campaign")]
+def _navigation(neighbours: Neighbours) -> str:
+    """Links to the campaign, and to the runs next to this one."""
+    links = [link("../index.html", "Campaign", data_go="campaign")]
     for go, words, neighbour in (("previous", "← run", neighbours.before), ("next", "run →", neighbours.after)):
         if neighbour is not None:
-            ways.append(link(neighbour[1], f"{words} {neighbour[0]}", data_go=go))
-    return f'<p class="ways">{" · ".join(ways)}</p>'
+            links.append(link(neighbour[1], f"{words} {neighbour[0]}", data_go=go))
+    return f'<p class="ways">{" · ".join(links)}</p>'
 
 
 def _solution_data(name: str, tables: RunTables, made: Made) -> Json:
@@ -168,7 +168,7 @@ def _milliseconds(value: Any) -> float | None:
     return None if value is None else round(value.timestamp() * 1000.0, 3)
 
 
-def _navigation(names: list[str]) -> str:
+def _contents(names: list[str]) -> str:
     buttons = "".join(
         f'<button type="button" data-solution="{escape(name)}" aria-pressed="false">{escape(name)}</button>'
         for name in names

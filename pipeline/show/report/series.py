@@ -61,7 +61,7 @@ def time_data(epochs: pl.DataFrame, moments_ns: Ints, gap_reset_s: float) -> Jso
 
 
 def _never_evaluated(epochs: pl.DataFrame, known: Collection[str]) -> dict[str, str]:
-    """Per drawing of monitors none of which was ever evaluated: the most frequent reason."""
+    """The most frequent reason for each drawing of monitors none of which was ever evaluated."""
     silent = {}
     for drawing, lines in monitor_lines().items():
         reasons = [epochs[f"{name}_reason"].cast(pl.String).alias("reason") for name, _ in lines]
@@ -91,7 +91,7 @@ def monitor_lines() -> dict[str, list[list[str]]]:
 
 
 def _ratios(epochs: pl.DataFrame) -> dict[str, Floats]:
-    """Each monitor's statistic over its threshold, signed: beyond -1 and 1 it fails."""
+    """Statistic of each monitor over its threshold, signed: beyond -1 and 1 it fails."""
     ratios = {}
     for monitor in MONITORS:
         value = floats(epochs, f"{monitor}_value")
@@ -109,6 +109,7 @@ def _residual(epochs: pl.DataFrame) -> Floats:
 
 
 def _series(t_ms: Ints, values: Floats, whole: Bools) -> Json:
+    """A series, thinned out if it is long."""
     if len(values) <= WHOLE_SERIES:
         return {"y": packed(values, "f4")}  # at every time in `t`
     rows = kept_rows(values, whole)
@@ -132,6 +133,7 @@ def _states(epochs: pl.DataFrame) -> list[tuple[str, str, Sequence[str], Ints]]:
 
 
 def _codes(states: pl.Series, order: Sequence[str]) -> Ints:
+    """States as numbers."""
     names = [str(name) for name in order]
     codes = pl.Series(range(len(names)), dtype=pl.Int64)
     known = states.cast(pl.String).fill_null(UNKNOWN)
@@ -139,6 +141,7 @@ def _codes(states: pl.Series, order: Sequence[str]) -> Ints:
 
 
 def _band(name: str, group: str, states: Sequence[str], codes: Ints, t_ms: Ints, hold_ms: int) -> Json:
+    """A band of states over time."""
     pieces: Band = band(t_ms, codes, hold_ms, gap_code=0)
     return {
         "name": name,

@@ -64,12 +64,19 @@ class _Page:
 
 
 def write_report(out: Path, site: Site | None = None, jobs: int = 0, most_pages: int = MOST_PAGES) -> list[Path]:
-    """Write `OUT/report`: `index.html`, and `runs/RUN.html` unless there are more than `most_pages`; the index first.
+    """Write `OUT/report`: `index.html`, and `runs/RUN.html` of each run.
 
-    The pages open from disk and make no request. Plans need the site; without it
-    places are drawn along the path. Pages of runs that are no longer in the result are removed; those that were made
-    from these very tables, settings and program are left as they are. `jobs` processes make the others, by
-    default one per core where there are many.
+    The pages open from disk and make no request. Pages of runs that are no longer in the result are removed; those that
+    were made from these very tables, settings and program are left as they are.
+
+    Args:
+        out: the result.
+        site: the site, for plans; None: places are drawn along the path.
+        jobs: processes that make pages; 0: one per core where there are many.
+        most_pages: of a result with more runs only the index is written.
+
+    Returns:
+        Paths of the pages, the index first.
     """
     markers = _markers(out)
     pages = _pages(out, site, markers, most_pages)
@@ -95,7 +102,20 @@ def write_report(out: Path, site: Site | None = None, jobs: int = 0, most_pages:
 
 
 def write_page(out: Path, run_id: str, site: Site | None = None, most_pages: int = MOST_PAGES) -> Path:
-    """Write the page of one run alone. Raises `UsageError` where it is not in the result."""
+    """Write the page of one run alone.
+
+    Args:
+        out: the result.
+        run_id: id of the run.
+        site: the site, for plans; None: places are drawn along the path.
+        most_pages: of a result with more runs the index names no pages.
+
+    Returns:
+        Path of the page.
+
+    Raises:
+        UsageError: the run is not in the result.
+    """
     markers = _markers(out)
     pages = {page.run: page for page in _pages(out, site, markers, most_pages)}
     if run_id not in pages:
@@ -108,7 +128,15 @@ def write_page(out: Path, run_id: str, site: Site | None = None, most_pages: int
 
 
 def write_against(out: Path, other: Address) -> Path:
-    """Write `OUT/report/against.html`: this result beside another; the next report of the result removes it."""
+    """Write `OUT/report/against.html`: this result compared with another; the next report of the result removes it.
+
+    Args:
+        out: the result.
+        other: the result that it is compared with.
+
+    Returns:
+        Path of the page.
+    """
     place = out / "report" / AGAINST
     storage.write_bytes(place, against_page(out, other).encode())
     _noted(out, [out / "report" / name for name in storage.files_below(out / "report")])
@@ -120,10 +148,16 @@ def _pages(out: Path, site: Site | None, markers: Mapping[str, str], most_pages:
     names = {run: page_name(run) for run in complete_runs(out)}
     config = read_config(out)
     made = Made(config or Configuration(), None if config is None else to_toml(config), site)
-    ways = [None, *((run, quote(name)) if len(names) <= most_pages else None for run, name in names.items()), None]
+    neighbours = [
+        None,
+        *((run, quote(name)) if len(names) <= most_pages else None for run, name in names.items()),
+        None,
+    ]
     folder = out / "report" / "runs"
     return [
-        _with_digest(_Page(out, run, folder / name, made, Neighbours(ways[at], ways[at + 2])), markers.get(run, ""))
+        _with_digest(
+            _Page(out, run, folder / name, made, Neighbours(neighbours[at], neighbours[at + 2])), markers.get(run, "")
+        )
         for at, (run, name) in enumerate(names.items())
     ]
 
@@ -147,12 +181,19 @@ def _noted(out: Path, pages: list[Path]) -> list[Path]:
 
 
 def page_name(run_id: str) -> str:
-    """File name of a run's page."""
+    """File name of a run's page.
+
+    Args:
+        run_id: id of the run.
+
+    Returns:
+        A name without characters that file systems refuse.
+    """
     return f"{file_name(run_id)}.html"
 
 
 def _with_digest(page: _Page, marker: str) -> _Page:
-    """With the SHA-256 over all that the page follows from: tables, settings, site, neighbours and program.
+    """The page with the SHA-256 over all it follows from: tables, settings, site, neighbours and program.
 
     Empty where the site has no digest: such a page is never known to be there.
     """

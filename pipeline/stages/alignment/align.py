@@ -11,7 +11,7 @@ from pipeline.stages.alignment.learning import Hold, ToLearn, learn
 from pipeline.stages.alignment.odometer_filter import Estimates, stamp_jitter_s
 from pipeline.stages.epochs.clock import periods_before_s
 from pipeline.stages.epochs.verdicts import NO_ODOMETER, NUMBER, first_reason
-from pipeline.stages.monitors.bank import along_axis
+from pipeline.stages.monitors.axes import along_axis
 from pipeline.stages.monitors.noise import NoiseMeter
 from pipeline.stages.odometry.driven import with_hysteresis
 from pipeline.stages.odometry.odometry import Odometry
@@ -27,7 +27,20 @@ BEYOND_SPAN = NotEvaluated.BEYOND_SPAN
 def align(
     positions: MatchedEpochs, odometry: Odometry | None, vehicle: Vehicle, config: Configuration
 ) -> AlignedEpochs:
-    """Positions of one solution with the odometer beside them; `odometry` grows with the path of the positions."""
+    """Positions of one solution with the odometer at each, and what a test along the track has to allow for.
+
+    Args:
+        positions: matched epochs of one solution, arrays of shape (n,).
+        odometry: the odometer, growing with the path of the positions; None without one.
+        vehicle: scale and latency, as far as the file gives them.
+        config: the configuration; used are `align`, `monitors`, `lds` and `matching`.
+
+    Returns:
+        The aligned epochs, arrays of shape (n,).
+
+    Source:
+        DOMAIN sections 3 and 4; DIAG eq. 1-3.
+    """
     most_m = config.scatter_limit_m
     positions = replace(
         positions,
@@ -53,7 +66,7 @@ def align(
 
 
 def stated_excess_m2(aligned: AlignedEpochs, holds: Sequence[Hold], config: Configuration) -> Floats:
-    """By how much the variance along the track is larger than stated, as epochs before each show it (DOMAIN section 3).
+    """Variance along the track beyond the stated one, as epochs before each show it (DOMAIN section 3).
 
     Measured in every run, whatever noise is given for the thresholds; nothing of a hold enters.
     """
@@ -101,15 +114,15 @@ def _allowed(positions: MatchedEpochs, config: Configuration) -> _Allowed:
 
 
 def unrolled(epochs: MatchedEpochs) -> Floats:
-    """Path position less what a curve adds to the way of a position beside the track [m]; NaN off the track.
+    """Path position less what a curve adds to the movement of a position off the track's axis [m]; NaN off the track.
 
     A point y to the left of a track with left curvature k moves dx / (1 - k y) along it while the train moves dx.
     """
     along = np.full(epochs.height, np.nan)
     rows = np.flatnonzero(epochs.near_track)
     path_m = epochs.path_m[rows]
-    beside = np.nan_to_num(epochs.curvature_per_m[rows] * epochs.cross_track_m[rows])
-    along[rows] = path_m - np.cumsum(beside * np.diff(path_m, prepend=path_m[:1]))
+    share = np.nan_to_num(epochs.curvature_per_m[rows] * epochs.cross_track_m[rows])
+    along[rows] = path_m - np.cumsum(share * np.diff(path_m, prepend=path_m[:1]))
     return along
 
 
@@ -124,9 +137,9 @@ def odometer_at(at_ns: Ints, aligned: AlignedEpochs, odometry: Odometry) -> Floa
     anchor_s = odometry.seconds(aligned.t_ns[anchors]) - aligned.latency_s[anchors]
     at_s = odometry.seconds(at_ns)
     near = (np.searchsorted(anchor_s, at_s, side="right") - 1).clip(0)
-    way = odometry.distance_at_s(at_s) - odometry.distance_at_s(anchor_s[near])
+    moved_m = odometry.distance_at_s(at_s) - odometry.distance_at_s(anchor_s[near])
     whole = odometry.doubt_at_s(at_s) == odometry.doubt_at_s(anchor_s[near])
-    distance = aligned.odometer_m[anchors[near]] + aligned.odometer_scale[anchors[near]] * way
+    distance = aligned.odometer_m[anchors[near]] + aligned.odometer_scale[anchors[near]] * moved_m
     return np.where(odometry.known_at_s(at_s) & whole, distance, np.nan)
 
 
@@ -139,7 +152,7 @@ def _with_odometer(
     in_use: Estimates,
     config: Configuration,
 ) -> AlignedEpochs:
-    """Each column read at the epoch less the latency in use there."""
+    """Columns of the odometer, read at each epoch less the latency in use there."""
     t_ns = positions.t_ns
     at = odometry.seconds(t_ns) - in_use.latency_s
     known = odometry.known_at_s(at)
@@ -185,7 +198,9 @@ def _with_odometer(
 
 
 def _direction(speed_mps: Floats, deadband_mps: float) -> Ints:
-    """+1 or -1 along growing path, held inside the dead band; the path grows the way that the run begins."""
+    """+1 or -1 along growing path, held inside the dead band; the path grows in the direction in which the run
+    begins.
+    """
     known_mps = np.nan_to_num(speed_mps)
     moving = np.abs(known_mps) > deadband_mps
     last = np.maximum.accumulate(np.where(moving, np.arange(moving.size), -1))
@@ -231,7 +246,7 @@ def _without_odometer(
 
 
 def speed_of_positions(t_s: Floats, path_m: Floats, window_s: float) -> Floats:
-    """By positions at least `window_s` apart, causal [m/s]; NaN where there are none."""
+    """Speed by positions at least `window_s` apart, causal [m/s]; NaN where there are none."""
     speed = np.full(t_s.size, np.nan)
     valid = np.flatnonzero(np.isfinite(path_m))
     if valid.size < 2:

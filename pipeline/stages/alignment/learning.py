@@ -21,7 +21,7 @@ from pipeline.stages.monitors.axis import (
 )
 from pipeline.stages.monitors.noise import NoiseMeter
 from pipeline.stages.odometry.bound import RecoveryRule
-from pipeline.stages.odometry.driven import under_way
+from pipeline.stages.odometry.driven import is_moving
 from pipeline.stages.odometry.odometry import Odometry
 from schemas.arrays import Bools, Floats, Ints
 from schemas.config import Configuration, Vehicle
@@ -57,7 +57,17 @@ def learn(
     vehicle: Vehicle,
     config: Configuration,
 ) -> tuple[Estimates, list[Hold]]:
-    """Scale and latency at each epoch: from the vehicle file, or learned from earlier epochs only; and the holds."""
+    """Scale and latency at each epoch: from the vehicle file, or learned from earlier epochs only.
+
+    Args:
+        positions: what is learned from, arrays of shape (n,).
+        odometry: the odometer, growing with the path of the positions.
+        vehicle: scale and latency, as far as the file gives them.
+        config: the configuration; used are `align`, `monitors` and `hazards.limits`.
+
+    Returns:
+        Estimates of shape (n,), and the holds: epochs of alarm and recovery.
+    """
     prior = prior_of(vehicle, config.align)
     learned = prior.over(positions.t_ns.size)
     learner = _Learner(positions, odometry, vehicle, config, learned)
@@ -117,9 +127,9 @@ class _Learner:
         self._breaks = _gaps_before(self._t_s, self._t_s, gap_s[self._rows])
         self._outages = _gaps_before(self._t_s, t_s[usable], gap_s[usable])
         if self._rows.size:
-            way_m = odometry.travelled_at(self._t_ns)
+            travelled_m = odometry.travelled_at(self._t_ns)
             deadband_mps = config.matching.deadband_mps
-            moving = under_way(self._t_s, way_m, deadband_mps, config.align.speed_window_s)
+            moving = is_moving(self._t_s, travelled_m, deadband_mps, config.align.speed_window_s)
             series = self._series(0, self._rows.size, 0)
             self._meter = NoiseMeter(series, moving, config.monitors.noise_along_m, config)
 
@@ -150,6 +160,7 @@ class _Learner:
         return prior
 
     def _observation(self, row: int) -> tuple[float, float]:
+        """Time [s] and path position [m] of a row."""
         return float(self._t_s[row]), float(self._path_m[row])
 
     def _learn_until_alarm(self, state: FilterState, begin: int) -> tuple[FilterState, int]:
@@ -200,7 +211,7 @@ class _Learner:
         return state, np.maximum(use_from, due + 1), joints
 
     def _beyond_break(self, state: FilterState, before: int, row: int) -> FilterState:
-        """Where the odometer lost its distance the offset begins anew: nothing shows whether the position moved."""
+        """Begin the offset anew where the odometer lost its distance: nothing shows whether the position moved."""
         if self._doubt_m[before] == self._doubt_m[row]:
             observed = *self._observation(row), float(self._sigma_m[row]), float(self._jitter_s[row])
             return self._filter.resume(state, *observed, self._moved_m)
@@ -223,6 +234,7 @@ class _Learner:
         self._learned.put(epochs[use_from], estimates_of(joints))
 
     def _next(self, t_s: float, at_least: int) -> int:
+        """The first row from `at_least` on that is not before a time."""
         return max(at_least, bisect_left(self._times, t_s))
 
     def _series(self, begin: int, end: int, restart: int) -> AxisSeries:
@@ -282,11 +294,11 @@ class _Learner:
         """What GNSS minus odometer moves by from the anchor to rows [begin, end) without a fault [m^2]."""
         sigma_m = self._sigma_m
         t_ns = self._t_ns
-        way_m = np.diff(self._odometry.travelled_at(np.append(t_ns[anchor], t_ns[begin:end])))
+        driven_m = np.diff(self._odometry.travelled_at(np.append(t_ns[anchor], t_ns[begin:end])))
         positions_m2 = sigma_m[anchor] ** 2 + sigma_m[begin:end] ** 2
         elapsed_s = self._t_s[begin:end] - self._t_s[anchor]
         sigma_scale = self._vehicle.odometer_scale_sigma or 0.0
-        return self._rule.variance_m2(positions_m2, elapsed_s, np.cumsum(way_m), max(scale_sigma, sigma_scale))
+        return self._rule.variance_m2(positions_m2, elapsed_s, np.cumsum(driven_m), max(scale_sigma, sigma_scale))
 
 
 def _gaps_before(at_s: Floats, t_s: Floats, gap_s: Floats) -> Ints:
@@ -296,4 +308,5 @@ def _gaps_before(at_s: Floats, t_s: Floats, gap_s: Floats) -> Ints:
 
 
 def _in_use(use_from: Ints, row: int) -> int:
+    """Which of the states is in use at a row: the last one whose use has begun."""
     return int(np.searchsorted(use_from, row, side="right")) - 1

@@ -7,7 +7,7 @@ Observed is the GNSS path position against the odometer's distance at the time o
 with unit first-order Gauss-Markov errors e_j of the monitor bank's own model, so that the estimate's covariance
 tells what the data really say about scale and latency; the offset walks with the odometer's white noise.
 
-After a break a position may come back beside its place, and return to it or stay there, by no more than the monitors
+After a break a position may come back off its place, and return to it or stay there, by no more than the monitors
 let pass. So the offset may have moved over the break, and walks on until a position has settled.
 """
 
@@ -37,9 +37,11 @@ class Estimates(NamedTuple):
     latency_sigma_s: Floats
 
     def over(self, epochs: int) -> Estimates:
+        """The same at so many epochs."""
         return Estimates(*(np.full(epochs, value) for value in self))
 
     def at(self, rows: Ints) -> Estimates:
+        """The estimates at some epochs."""
         return Estimates(*(column[rows] for column in self))
 
     def put(self, begins: Ints, changes: Estimates) -> None:
@@ -85,6 +87,7 @@ class FilterState(NamedTuple):
 
 
 def estimates_of(joints: Floats) -> Estimates:
+    """Scale and latency with their sigmas of joint states, shape (..., states, states + 1)."""
     means = joints[..., -1]
     deviations = np.sqrt(np.diagonal(joints, axis1=-2, axis2=-1))
     return Estimates(1.0 + means[..., _SCALE], deviations[..., _SCALE], means[..., _LATENCY], deviations[..., _LATENCY])
@@ -96,11 +99,12 @@ class _Scatter(NamedTuple):
     still_m2: float
     moving_s2: float
     faster_s2: float
-    seen_mps: float
+    shown_mps: float
 
 
 def _scatters(known: KnownNoise, jitter_s: Floats) -> list[_Scatter]:
-    columns = known.still_m2, jitter_s**2 + known.moving_s2, known.faster_s2, known.seen_mps
+    """Scatters of each epoch, as plain numbers: the filter runs row by row."""
+    columns = known.still_m2, jitter_s**2 + known.moving_s2, known.faster_s2, known.shown_mps
     return [_Scatter(*row) for row in zip(*(column.tolist() for column in columns), strict=True)]
 
 
@@ -143,17 +147,18 @@ class ScaleLatencyFilter:
         known = self.odometry.noise_at_s(np.array([t_s]))
         walked_m2 = state.unsettled_m2 - left_m2 + known.white_m2_per_s.item() * step_ns * 1e-9
         self._predict(state.joint, step_ns, walked_m2, joint)
-        seen, speed_mps = self._seen(joint, row, t_s, path_m, state.origin_m)
+        innovation, speed_mps = self._innovation(joint, row, t_s, path_m, state.origin_m)
         (scatter,) = _scatters(known, np.array([jitter_s]))
-        variance_m2 = row.dot(seen[:-1]).item() + self.config.white_share * sigma_m**2
+        variance_m2 = row.dot(innovation[:-1]).item() + self.config.white_share * sigma_m**2
         variance_m2 += self._scatter_m2(scatter, speed_mps)
         probability = self.config.break_moved_probability * -math.expm1((state.t_s - t_s) / self.config.break_moving_s)
         # Beyond the prior of the offset nothing changes, but the digits of the position's noise would be lost.
-        brought_m2 = min(moved_m2(seen.item(-1), variance_m2, limit_m, probability), _OFFSET_PRIOR_M2)
+        brought_m2 = min(moved_m2(innovation.item(-1), variance_m2, limit_m, probability), _OFFSET_PRIOR_M2)
         joint[_OFFSET, _OFFSET] += brought_m2
         return FilterState(joint, t_s, state.origin_m, left_m2 + brought_m2)
 
     def after(self, state: FilterState, joint: Floats, t_s: float) -> FilterState:
+        """The state after an epoch, with what has settled since."""
         return state._replace(joint=joint, t_s=t_s, unsettled_m2=self._unsettled_m2(state, t_s))
 
     def run(self, state: FilterState, t_s: Floats, path_m: Floats, sigma_m: Floats, jitter_s: Floats) -> Floats:
@@ -174,16 +179,16 @@ class ScaleLatencyFilter:
         epochs = zip(joints, rows, times_s, path_m.tolist(), white_m2, scatters, steps_ns, walks_m2, strict=True)
         for joint, row, now_s, place_m, noise_m2, scatter, step_ns, walk_m2 in epochs:
             self._predict(before, step_ns, walk_m2, joint)
-            seen, speed_mps = self._seen(joint, row, now_s, place_m, state.origin_m)
-            spread = seen[:-1]
+            innovation, speed_mps = self._innovation(joint, row, now_s, place_m, state.origin_m)
+            spread = innovation[:-1]
             # Kalman update of covariance and mean at once: minus gain times (H P, predicted minus observed).
             variance_m2 = row.dot(spread).item() + noise_m2 + self._scatter_m2(scatter, speed_mps)
-            joint -= (spread / variance_m2)[:, None] * seen
+            joint -= (spread / variance_m2)[:, None] * innovation
             before = joint
         return joints
 
     def _rows(self, sigma_m: Floats) -> Floats:
-        """Observation matrix: d(position) / d(state); scale and latency are filled in by `_seen`."""
+        """Observation matrix: d(position) / d(state); scale and latency are filled in by `_innovation`."""
         rows: Floats = sigma_m[:, None] * np.concatenate([np.zeros(_ERRORS), np.sqrt(self.shares)])
         rows[:, _OFFSET] = 1.0
         return rows
@@ -195,26 +200,29 @@ class ScaleLatencyFilter:
         joint += noise
         joint[_OFFSET, _OFFSET] += walked_m2
 
-    def _seen(self, joint: Floats, row: Floats, now_s: float, place_m: float, origin_m: float) -> tuple[Floats, float]:
+    def _innovation(
+        self, joint: Floats, row: Floats, now_s: float, place_m: float, origin_m: float
+    ) -> tuple[Floats, float]:
         """H P and, as its last element, predicted minus observed position; and the speed. Completes `row` (H).
 
         The distance is already read at the mean latency, whose part in H is taken out again.
         """
         scale = 1.0 + joint.item(_SCALE, -1)
         latency_s = joint.item(_LATENCY, -1)
-        way_m, speed_mps = self._odometer_at(now_s - latency_s, origin_m)
-        row[_SCALE], row[_LATENCY] = slopes(way_m, speed_mps, scale)
-        seen: Floats = row.dot(joint)
-        seen[-1] += way_m + scale * speed_mps * latency_s - place_m
-        return seen, speed_mps
+        distance_m, speed_mps = self._odometer_at(now_s - latency_s, origin_m)
+        row[_SCALE], row[_LATENCY] = slopes(distance_m, speed_mps, scale)
+        innovation: Floats = row.dot(joint)
+        innovation[-1] += distance_m + scale * speed_mps * latency_s - place_m
+        return innovation, speed_mps
 
     @staticmethod
     def _scatter_m2(scatter: _Scatter, speed_mps: float) -> float:
         """Variance of stamps and of the odometer's rows, both without memory [m^2]."""
-        faster = max(speed_mps**2 - scatter.seen_mps**2, 0.0)
+        faster = max(speed_mps**2 - scatter.shown_mps**2, 0.0)
         return scatter.still_m2 + scatter.moving_s2 * speed_mps**2 + scatter.faster_s2 * faster
 
     def _unsettled_m2(self, state: FilterState, t_s: float) -> float:
+        """What of the offset has still to settle at a later time [m^2]."""
         return state.unsettled_m2 * math.exp((state.t_s - t_s) / self.config.settling_tau_s)
 
     def _odometer_at(self, at_s: float, origin_m: float) -> tuple[float, float]:
@@ -228,7 +236,7 @@ class ScaleLatencyFilter:
 
     @cached_property
     def _transition(self) -> Callable[[int], tuple[Floats, Floats]]:
-        """With a memory: a receiver's epochs are mostly the same time apart."""
+        """The transition of one step, remembered: a receiver's epochs are mostly the same time apart."""
         return lru_cache(maxsize=32)(self._transition_over)
 
     def _transition_over(self, dt_ns: int) -> tuple[Floats, Floats]:
@@ -240,23 +248,24 @@ class ScaleLatencyFilter:
         return np.outer(decay, np.append(decay, 1.0)), np.column_stack([np.diag(noise), np.zeros(decay.size)])
 
 
-def moved_m2(beside_m: float, variance_m2: float, limit_m: float, probability: float) -> float:
-    """Mean square of a move over a break, given that the position appears `beside_m` from its place (Bayes).
+def moved_m2(offset_m: float, variance_m2: float, limit_m: float, probability: float) -> float:
+    """Mean square of a move over a break, given that the position appears `offset_m` from its place (Bayes).
 
     Prior: moved with `probability`, then normally distributed with a sigma of `limit_m`.
     """
     gain = limit_m**2 / (limit_m**2 + variance_m2)
-    evidence = math.exp(min(0.5 * gain * beside_m**2 / variance_m2, _CERTAIN))
+    evidence = math.exp(min(0.5 * gain * offset_m**2 / variance_m2, _CERTAIN))
     odds = probability / (1.0 - probability) * math.sqrt(1.0 - gain) * evidence
-    return odds / (1.0 + odds) * gain * (gain * beside_m**2 + variance_m2)
+    return odds / (1.0 + odds) * gain * (gain * offset_m**2 + variance_m2)
 
 
 def _nanoseconds(seconds: float) -> int:
+    """Whole nanoseconds."""
     return round(seconds * 1e9)
 
 
 def prior_of(vehicle: Vehicle, config: AlignConfig) -> Estimates:
-    """By the vehicle file, else the configured prior around 1 and 0."""
+    """Prior of scale and latency by the vehicle file, else the configured one around 1 and 0."""
     scale = 1.0, config.scale_prior_sigma
     latency_s = 0.0, config.latency_prior_sigma_s
     if vehicle.odometer_scale is not None:

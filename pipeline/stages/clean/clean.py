@@ -26,6 +26,7 @@ _NS_PER_H = 3_600 * NS_PER_S
 
 
 def require_two_times(stream: pl.DataFrame, place: str, of: str = "") -> None:
+    """Refuse a stream (unique times) of fewer than two rows; `of`: words that say whose it is."""
     if stream.height < 2:
         raise InputError(
             f"all rows have the same time{of}" if stream.height else f"no row has a time after 1970{of}",
@@ -52,16 +53,17 @@ def require_one_journey(fixes: pl.DataFrame, place: str, config: IngestConfig) -
 
 
 def require_spans(run: RunLog, config: IngestConfig) -> None:
-    """Of the streams beside the positions; of these each solution is asked."""
+    """Refuse streams other than the positions that last too long; of positions each solution is asked."""
     odometers = [("odometer", odometer) for odometer in (run.odometer, *run.other_odometers)]
     satellites = [] if run.satellites is None else run.satellites.partition_by("solution", maintain_order=True)
-    others = [("reference", run.reference), ("balise_reads", run.balise_reads)]
+    others = [(name, run.stream(name)) for name in _OF_POSITIONS if name != "satellites"]
     for name, frame in [*odometers, *(("satellites", part) for part in satellites), *others]:
         if frame is not None:
             require_span(frame["t"], f"{run.run_id}: {name}", config)
 
 
 def require_span(t: pl.Series, place: str, config: IngestConfig) -> None:
+    """Refuse times in order that last longer than a journey (`ingest.longest_journey_h`)."""
     t_ns = t.cast(pl.Int64)
     if t.len() and int(t_ns[-1]) - int(t_ns[0]) > config.longest_journey_h * _NS_PER_H:
         raise InputError(
@@ -84,12 +86,13 @@ _SOURCES = ("solution", "sensor")
 """Columns that part a stream into sources, each with its own order of time."""
 _PLACE = ("latitude_deg", "longitude_deg")
 # Streams that say something only of positions: without them a run is replayed all the same.
-_OF_POSITIONS: tuple[Stream, ...] = ("satellites", "reference", "balise_reads")
+_OF_POSITIONS = tuple(name for name in STREAMS if name not in ("gnss", "odometer", "faults"))
 ClockAdvice = Callable[[RunLog], str]
 """What moves recorders of different times to one journey, in a sentence; empty where nothing does."""
 
 
 def no_advice(run: RunLog) -> str:
+    """No sentence of help for recorders without a time in common."""
     return ""
 
 
@@ -126,7 +129,18 @@ def clean(
 
     Left out are a few rows more than a day from the others (a receiver that did not know the date yet), all before
     1970, and reads, reference and satellites of another day than the positions; placeholders stay as epochs without a
-    fix. `InputError` where nothing can be replayed: no two times, none in common, longer than a journey.
+    fix.
+
+    Args:
+        run: the run as recorded.
+        config: the configuration; used are `ingest`, `lds.odometer_sensor` and `align.fastest_mps`.
+        clock_advice: what would move recorders of different times to one journey, for the error's remedy.
+
+    Returns:
+        The run in order, and how many rows were left out and why.
+
+    Raises:
+        InputError: nothing can be replayed: no two times, none in common, longer than a journey.
     """
     dated = _dated_streams(run, config.ingest.wrong_dates_share)
     streams: dict[str, pl.DataFrame] = {}
@@ -165,6 +179,7 @@ def _dated_streams(run: RunLog, few: float) -> dict[Stream, tuple[pl.DataFrame, 
 def _solution_counts(
     recorded: pl.DataFrame, far: pl.DataFrame, placeholders: Mapping[str, int], held: Mapping[str, int]
 ) -> dict[str, StreamCounts]:
+    """Counts by solution; `placeholders` and `held` as they were found already."""
     counts: dict[str, StreamCounts] = {}
     for part in recorded.select("solution", "t", *_PLACE).partition_by("solution", maintain_order=True):
         name = part["solution"][0]
@@ -292,6 +307,7 @@ def _far_from_any(t: pl.Series, positions: pl.Series) -> Bools:
 
 
 def _of_solution(part: pl.DataFrame, far: pl.DataFrame) -> StreamCounts:
+    """Counts of one solution; `far`: rows of all solutions that were left out for a time of another day."""
     counts = _in_order(part, ["t"])[1]
     contradicting = 0
     if counts.duplicates:
@@ -307,7 +323,7 @@ def stamp_counts(stream: Stream, frame: pl.DataFrame) -> StreamCounts:
 
 
 def _in_order(frame: pl.DataFrame, keys: list[str]) -> tuple[pl.DataFrame, StreamCounts]:
-    """In order of time, the first of each `keys`; how many were duplicates, how many recorded too late."""
+    """Rows in order of time, the first of each `keys`; how many were duplicates, how many recorded too late."""
     frame = frame.with_columns(pl.col("t").cast(pl.Datetime("ns", "UTC")))
     if (np.diff(times_ns(frame)) > 0).all():
         return frame, StreamCounts()
@@ -342,7 +358,7 @@ def _require_common_time(run: RunLog, clock_advice: ClockAdvice) -> None:
         )
 
 
-# Numerics of the reading: with fewer updates no period is known; a regular one is met, to a logged step, by so many of
+# Numerics of the reading: with fewer updates no period is known; a regular one is kept, to a logged step, by so many of
 # the updates. Digits that repeat at low speed are not: their time changes with the speed.
 _FEWEST = 20
 _REGULAR_SHARE = 0.8
@@ -423,6 +439,7 @@ def _far(t_ns: Ints, places: Floats, config: IngestConfig, fastest_mps: float) -
 
 
 def _is_brief(t_ns: Ints, until: int, config: IngestConfig) -> bool:
+    """The rows before `until` take no longer than the search for a first fix."""
     spent_s = (t_ns[until - 1] - t_ns[0]) / NS_PER_S
     whole_s = (t_ns[-1] - t_ns[0]) / NS_PER_S
     return bool(

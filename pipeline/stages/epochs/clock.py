@@ -36,6 +36,7 @@ class Clock:
 
     @classmethod
     def of(cls, epochs: pl.DataFrame, config: Configuration) -> Clock:
+        """The clock of an epochs table."""
         return cls.at(times_ns(epochs), position_ns(epochs), config)
 
     @classmethod
@@ -47,11 +48,12 @@ class Clock:
 
     @property
     def duration_s(self) -> float | None:
+        """Time from the first epoch to the last [s]."""
         return float(self.t_ns[-1] - self.t_ns[0]) / 1e9 if len(self.t_ns) else None
 
 
 def holds(frame: pl.DataFrame, condition: pl.Expr) -> Bools:
-    """Where a condition holds; null is false."""
+    """Whether a condition holds at each row; null is false."""
     return frame.select(condition.fill_null(value=False)).to_series().to_numpy()
 
 
@@ -99,7 +101,7 @@ def position_ns(epochs: pl.DataFrame) -> Ints:
 
 
 def periods_before_s(t_ns: Ints) -> Floats:
-    """Per epoch the median of the last 100 steps before its own [s]; 0 where there is none."""
+    """Median of the last 100 steps before each epoch [s]; 0 where there is none."""
     medians = pl.Series(np.diff(t_ns), dtype=pl.Float64).rolling_median(_PERIOD_STEPS, min_samples=1).to_numpy()
     return np.concatenate([[0.0, 0.0], medians[:-1]])[: t_ns.size] / NS_PER_S
 
@@ -159,7 +161,7 @@ def uptime(t_ns: Ints, good: Bools, limit_s: float) -> Uptime:
 
 
 def held_s(t_ns: Ints, limit_s: float) -> Floats:
-    """For how long the state of each epoch is known to hold [s]: to the next epoch, 0 before a gap."""
+    """Time for which the state of each epoch is known to hold [s]: to the next epoch, 0 before a gap."""
     steps = np.diff(t_ns, append=t_ns[-1:]) / NS_PER_S
     return np.where(steps <= limit_s, steps, 0.0)
 

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+
 import numpy as np
 import numpy.typing as npt
 import polars as pl
 
-from schemas.arrays import NS_PER_S, Bools, Floats, Ints, flags, ints, times_ns, truths
+from schemas.arrays import NS_PER_S, Bools, Floats, Ints, Rows, floats, ints
 from schemas.enums import MonitorState, NotEvaluated
 from schemas.frozen import frozen
 from schemas.stages import NO_REASON, REASONS, reason_words
@@ -27,6 +29,7 @@ PASS, FAIL, NOT_EVALUATED = (
 )
 NUMBER = {reason: number for number, reason in enumerate(REASONS)}
 """Of each reason in `schemas.stages.REASONS`."""
+_NUMBERS = {reason.value: number for reason, number in NUMBER.items()}
 # Made once: a replay asks for them at every monitor, and an enumeration takes longer to make than to index.
 _STATE_WORDS = pl.Series(STATES, dtype=pl.Enum(STATES))
 
@@ -46,10 +49,11 @@ class Verdicts:
 
     @property
     def fails(self) -> Bools:
+        """Epochs at which the monitor fails."""
         return np.asarray(self.state == FAIL)
 
     def without_passes(self, reason: NotEvaluated) -> Verdicts:
-        """Of a monitor that can find a fault, but not say that there is none."""
+        """Verdicts of a monitor that can find a fault, but not say that there is none."""
         void = self.state == PASS
         return Verdicts(
             value=np.where(void, np.nan, self.value),
@@ -57,6 +61,28 @@ class Verdicts:
             state=np.where(void, NOT_EVALUATED, self.state).astype(np.int8),
             reason=np.where(void, NUMBER[reason], self.reason),
         )
+
+    @property
+    def evaluated(self) -> Bools:
+        return np.asarray(self.state != NOT_EVALUATED)
+
+    def at(self, rows: Rows) -> Verdicts:
+        """Those of some epochs."""
+        return Verdicts(self.value[rows], self.threshold[rows], self.state[rows], self.reason[rows])
+
+    @classmethod
+    def of_table(cls, table: pl.DataFrame, name: str) -> Verdicts:
+        """From the columns of the `epochs` table; what the table lacks of them is not known."""
+        nothing = np.full(table.height, np.nan)
+        value, threshold = (
+            floats(table, column) if column in table.columns else nothing
+            for column in (f"{name}_value", f"{name}_threshold")
+        )
+        state = ints(table[f"{name}_state"].cast(_STATE_WORDS.dtype).to_physical(), NOT_EVALUATED).astype(np.int8)
+        reason = np.full(table.height, NO_REASON)
+        if f"{name}_reason" in table.columns:
+            reason = ints(table[f"{name}_reason"].replace_strict(_NUMBERS, default=None, return_dtype=pl.Int64))
+        return cls(value, threshold, state, reason)
 
     def columns(self, name: str) -> list[pl.Series]:
         """Columns of `epochs` for the monitor of this name; null where it is not evaluated."""
@@ -75,10 +101,18 @@ def states_of(value: Floats, threshold: Floats, evaluated: Bools) -> States:
 
 
 def verdicts(value: Floats, threshold: Floats, reasons: Ints, state: States | None = None) -> Verdicts:
-    """The verdicts of a monitor; `reasons`: why it is not evaluated, `NO_REASON` where it is (`first_reason`).
+    """The verdicts of a monitor.
 
-    `state` where the monitor gives it already. Else what has no reason and yet no value or threshold is not
-    evaluated either: absence is never health.
+    What has no reason and yet no value or threshold is not evaluated either: absence is never health.
+
+    Args:
+        value: what is tested, in the unit of the monitor, shape (n,).
+        threshold: beyond it the monitor fails, shape (n,).
+        reasons: why it is not evaluated, by number, `NO_REASON` where it is (`first_reason`), shape (n,).
+        state: states by number, where the monitor gives them already, shape (n,).
+
+    Returns:
+        Verdicts of n rows, NaN where not evaluated.
     """
     unexplained = reasons == NO_REASON
     if state is None:
@@ -94,13 +128,13 @@ def verdicts(value: Floats, threshold: Floats, reasons: Ints, state: States | No
 
 
 def no_verdicts(epochs: int, reason: NotEvaluated) -> Verdicts:
-    """Of a monitor that has nothing to look at in the whole run."""
+    """Verdicts of a monitor that has nothing to look at in the whole run."""
     nothing = np.full(epochs, np.nan)
     return verdicts(nothing, nothing, np.full(epochs, NUMBER[reason]))
 
 
 def first_reason(*reasons: tuple[Bools, NotEvaluated | Ints]) -> Ints:
-    """Per epoch the first reason whose mask holds, `NO_REASON` where none does; a reason may be given per epoch."""
+    """The first reason whose mask holds at each epoch, or `NO_REASON`; a reason may be given per epoch."""
     first = np.full(reasons[0][0].shape, NO_REASON)
     for mask, reason in reversed(reasons):
         number = NUMBER[reason] if isinstance(reason, NotEvaluated) else reason
@@ -155,51 +189,48 @@ class FailureLog:
         return next((alarm.start_ns for alarm in self.alarms if begin_ns <= alarm.start_ns < end_ns), None)
 
 
-def failure_log(epochs: pl.DataFrame, recovery_s: float) -> FailureLog:
-    """Of one solution's epochs, with `negated`; monitors that the frame does not hold were not evaluated."""
-    t_ns = times_ns(epochs)
-    monitors = [name for name in MONITORS if f"{name}_state" in epochs.columns]
-    columns = [_fails(epochs[f"{name}_state"]) for name in monitors]
-    failed = np.column_stack(columns) if columns else np.zeros((t_ns.size, 0), np.bool_)
-    rows = np.flatnonzero(failed.any(axis=1))
+def failure_log(t_ns: Ints, negated: Bools, monitors: Mapping[str, Verdicts], recovery_s: float) -> FailureLog:
+    """Fails and alarms of one solution.
+
+    Args:
+        t_ns: stamps of its epochs in order [ns], shape (epochs,).
+        negated: where the LDS negated the position, shape (epochs,).
+        monitors: verdicts by the name of the monitor; those that are not given were not evaluated.
+        recovery_s: fails no farther apart are one alarm [s].
+
+    Returns:
+        Failing epochs with their first monitor, and the alarms.
+    """
+    names = [name for name in MONITORS if name in monitors]
+    failed = np.array([monitors[name].fails for name in names], dtype=np.bool_).reshape(len(names), t_ns.size)
+    rows = np.flatnonzero(failed.any(axis=0))
     breaks = np.flatnonzero(np.diff(t_ns[rows]) >= recovery_s * NS_PER_S) + 1
     parts = [part for part in np.split(rows, breaks) if part.size]
     return FailureLog(
         t_ns=t_ns,
-        negated=flags(epochs, "negated"),
+        negated=negated,
         failing=rows,
-        first_monitor=tuple(monitors[failed[row].argmax()] for row in rows.tolist()),
-        alarms=tuple(_alarm(epochs, t_ns, part, failed[part], monitors) for part in parts),
+        first_monitor=tuple(names[first] for first in failed[:, rows].argmax(axis=0).tolist()) if names else (),
+        alarms=tuple(_alarm(t_ns, part, failed[:, part], names, monitors) for part in parts),
     )
 
 
-def _fails(state: pl.Series) -> Bools:
-    """Where a monitor fails."""
-    if isinstance(state.dtype, pl.Enum):
-        # By number, several times faster than by word: a replay asks for each of its monitors.
-        return np.asarray(ints(state.to_physical()) == FAIL)
-    return truths(state == MonitorState.FAIL.value)
-
-
-def _alarm(epochs: pl.DataFrame, t_ns: Ints, rows: Ints, failed: Bools, monitors: list[str]) -> AlarmEpisode:
-    """One alarm of the failing epochs `rows`; `failed`: at each which monitors."""
+def _alarm(
+    t_ns: Ints, rows: Ints, failed: Bools, monitors: list[str], verdicts_of: Mapping[str, Verdicts]
+) -> AlarmEpisode:
+    """One alarm of the failing epochs `rows`; `failed`: of each monitor at which of them."""
     first = int(rows[0])
     last = int(rows[-1])
     # By their first fail; those of one epoch in the order of the contract.
-    columns = sorted(np.flatnonzero(failed.any(axis=0)).tolist(), key=lambda column: failed[:, column].argmax())
-    names = tuple(monitors[column] for column in columns)
-    peak = _peak(epochs[first : last + 1], names)
+    failing = sorted(np.flatnonzero(failed.any(axis=1)).tolist(), key=lambda monitor: failed[monitor].argmax())
+    names = tuple(monitors[monitor] for monitor in failing)
+    peak = max((_peak(verdicts_of[name], slice(first, last + 1)) for name in names), default=0.0)
     return AlarmEpisode(first, last, int(t_ns[first]), int(t_ns[last]), names, peak)
 
 
-def _peak(epochs: pl.DataFrame, monitors: tuple[str, ...]) -> float:
-    """Largest |value| / threshold where one of the monitors fails; 0 where neither is recorded."""
-    failing = {
-        name: (pl.col(f"{name}_state") == MonitorState.FAIL.value) & (pl.col(f"{name}_threshold") > 0)
-        for name in monitors
-    }
-    ratios = epochs.select(
-        (pl.col(f"{name}_value").abs() / pl.col(f"{name}_threshold")).filter(condition).max().alias(name)
-        for name, condition in failing.items()
-    )
-    return max((float(ratio) for ratio in ratios.row(0) if ratio is not None), default=0.0)
+def _peak(monitor: Verdicts, part: slice) -> float:
+    """Largest |value| / threshold where the monitor fails; 0 where neither is recorded."""
+    threshold = monitor.threshold[part]
+    failing = monitor.fails[part] & (threshold > 0.0)
+    ratios = np.abs(monitor.value[part][failing]) / threshold[failing]
+    return float(ratios[~np.isnan(ratios)].max(initial=0.0))

@@ -9,6 +9,6 @@ Nothing that came from GNSS is known here, and nothing of matching, alignment, m
 """
 
 from pipeline.stages.evidence.evidence import EvidenceSet, TrainEvidence, either
-from pipeline.stages.evidence.gathering import evidence_of, true_places
+from pipeline.stages.evidence.gathering import TruePlaces, evidence_of, true_places
 
-__all__ = ["EvidenceSet", "TrainEvidence", "either", "evidence_of", "true_places"]
+__all__ = ["EvidenceSet", "TrainEvidence", "TruePlaces", "either", "evidence_of", "true_places"]

@@ -10,10 +10,10 @@ from typing import NamedTuple
 import numpy as np
 import polars as pl
 
-from pipeline.stages.evidence.carrying import Counter, RecorderClock, TrueAnchor
-from pipeline.stages.evidence.contradictions import KnownPath, Levels, median_about
+from pipeline.stages.evidence.carrying import RecorderClock, SignedOdometer, TrueAnchor
+from pipeline.stages.evidence.contradictions import KnownPath, Levels, median_along
 from pipeline.stages.odometry import Odometry
-from pipeline.stages.odometry.polarity import sense_of_ways, shared_ways_m
+from pipeline.stages.odometry.polarity import relative_sense, shared_movement_m
 from pipeline.stages.odometry.scale_lag import spans_of_rows
 from pipeline.stages.reference import ReferenceStretch
 from pipeline.stages.track.path import Place
@@ -24,7 +24,7 @@ from schemas.enums import BaliseKind, Evidence
 from schemas.frozen import frozen
 
 # DOMAIN section 5.1: a train that stood for so long at the last row stands for up to so much more [s].
-_STOOD_S = 2.0
+_STANDSTILL_S = 2.0
 _STANDS_S = 1.0
 
 
@@ -44,18 +44,20 @@ def final_stands(
     ends: list[tuple[int, bool]] = []
     for odometer in odometers:
         end_ns = np.array([odometer.epoch_ns + round(float(odometer.t_s[-1]) * 1e9)])
-        ends.append((int(end_ns[0]), bool(odometer.stood(end_ns - round(_STOOD_S * NS_PER_S), end_ns)[0])))
+        ends.append(
+            (int(end_ns[0]), bool(odometer.was_at_standstill(end_ns - round(_STANDSTILL_S * NS_PER_S), end_ns)[0]))
+        )
     for stretch in reference:
         last_ns = int(stretch.t_ns[-1])
         path = stretch.paths[0]
-        rows = slice(int(np.searchsorted(stretch.t_ns, last_ns - round(_STOOD_S * NS_PER_S))), None)
+        rows = slice(int(np.searchsorted(stretch.t_ns, last_ns - round(_STANDSTILL_S * NS_PER_S))), None)
         spread_m = float(np.ptp(path.at_m[rows]))
         noise_m = 2.0 * config.hazards.evidence_factor * float(stretch.sigma_m[-1])
-        ends.append((last_ns, spread_m <= config.matching.deadband_mps * _STOOD_S + noise_m))
+        ends.append((last_ns, spread_m <= config.matching.deadband_mps * _STANDSTILL_S + noise_m))
     if not ends:
         return ()
-    last_ns, stood = max(ends)
-    return (Stand(last_ns),) if stood else ()
+    last_ns, standing = max(ends)
+    return (Stand(last_ns),) if standing else ()
 
 
 def still_standing(t_ns: Ints, stands: Sequence[Stand], config: Configuration) -> tuple[Ints, Floats]:
@@ -130,6 +132,7 @@ class KnownStretch:
         return [self._part(slice(first, last + 1)) for first, last in spans_of(~self.doubtful) if last > first]
 
     def _part(self, rows: slice) -> KnownStretch:
+        """The same stretch, with some of its rows only."""
         return replace(
             self,
             t_ns=self.t_ns[rows],
@@ -139,7 +142,7 @@ class KnownStretch:
             proved=self.proved[rows],
         )
 
-    def ends(self, counter: Counter) -> tuple[TrueAnchor, TrueAnchor]:
+    def ends(self, counter: SignedOdometer) -> tuple[TrueAnchor, TrueAnchor]:
         """The outermost samples at which the odometer counted: only from these is a place carried."""
         counted = np.flatnonzero(counter.odometer.known_at(self.t_ns))
         first, last = (counted if counted.size else np.arange(self.t_ns.size))[[0, -1]].tolist()
@@ -167,14 +170,14 @@ class Sided:
         )
 
     @property
-    def facing(self) -> int:
+    def first_oriented(self) -> int:
         """The oriented net element of the first sample, in the sense in which the odometer counts up."""
         path = self.stretch.paths[0]
         element, _, sense = path.legs[int(path.leg[0])].locate(path.at_m[:1])
         return 2 * int(element[0]) + int(sense[0] * self.sense < 0)
 
 
-def sided(stretch: ReferenceStretch, counter: Counter | None, least_m: float) -> Sided:
+def sided(stretch: ReferenceStretch, counter: SignedOdometer | None, least_m: float) -> Sided:
     """The sense in which the odometer counts along the path: by the first movement of `least_m` (DOMAIN section 2).
 
     Movements of the reference beyond its noise tell, where the odometer counted about as much: a reference that stands
@@ -185,8 +188,8 @@ def sided(stretch: ReferenceStretch, counter: Counter | None, least_m: float) ->
     if counter is not None:
         counted_m = counter.odometer.proved_between(stretch.t_ns[begin], stretch.t_ns[end])
         counted_m = np.where(np.abs(step_m) > 0.5 * np.abs(counted_m), counted_m, 0.0)
-    sense = sense_of_ways(counted_m, step_m, least_m)
-    shared_m = sense * shared_ways_m(counted_m, step_m)
+    sense = relative_sense(counted_m, step_m, least_m)
+    shared_m = sense * shared_movement_m(counted_m, step_m)
     with_m, against_m = (float((sign * shared_m).clip(min=0.0).sum()) for sign in (1, -1))
     return Sided(stretch, sense, with_m, against_m)
 
@@ -214,8 +217,8 @@ def _movements(stretch: ReferenceStretch) -> tuple[Ints, Ints, Floats]:
     return begins, ends, stretch.paths[0].at_m[ends] - stretch.paths[0].at_m[begins]
 
 
-def _ways_of(stretch: ReferenceStretch, begin: Ints, end: Ints) -> tuple[Ints, Ints, Floats]:
-    """Those of these pairs of samples that lie on one leg of the first path, and the way between them [m]."""
+def _on_one_leg(stretch: ReferenceStretch, begin: Ints, end: Ints) -> tuple[Ints, Ints, Floats]:
+    """The pairs of samples that lie on one leg of the first path, and the movement between them [m]."""
     path = stretch.paths[0]
     whole = path.leg[begin] == path.leg[end]
     begin = begin[whole]
@@ -223,26 +226,27 @@ def _ways_of(stretch: ReferenceStretch, begin: Ints, end: Ints) -> tuple[Ints, I
     return begin, end, path.at_m[end] - path.at_m[begin]
 
 
-def reference_ways(
+def reference_movements(
     sides: Sequence[Sided], lengths_m: Callable[[TrueAnchor, TrueAnchor], list[float]]
 ) -> tuple[Ints, Ints, Floats, Floats]:
-    """Ways of the reference between its stamps, as the odometer counts up: begin and end [ns], length and sigma [m].
+    """Movements of the reference between its stamps, as the odometer counts up: begin and end [ns], length and sigma
+    [m].
 
     Of ten seconds, and from stretch to stretch where `lengths_m` knows one: a slow reference is all gaps.
     """
     nothing = np.zeros(0, dtype=np.int64)
-    ways: list[tuple[Ints, Ints, Floats, Floats]] = [(nothing, nothing, np.zeros(0), np.zeros(0))]
+    movements: list[tuple[Ints, Ints, Floats, Floats]] = [(nothing, nothing, np.zeros(0), np.zeros(0))]
     for side in sides:
         t_ns = side.stretch.t_ns
-        begin, end, way_m = _ways_of(side.stretch, *spans_of_rows((t_ns - t_ns[0]) / NS_PER_S))
+        begin, end, moved_m = _on_one_leg(side.stretch, *spans_of_rows((t_ns - t_ns[0]) / NS_PER_S))
         sigma_m = np.hypot(side.stretch.sigma_m[begin], side.stretch.sigma_m[end])
-        ways.append((t_ns[begin], t_ns[end], side.sense * way_m, sigma_m))
+        movements.append((t_ns[begin], t_ns[end], side.sense * moved_m, sigma_m))
     for before, after in pairwise(sorted(sides, key=lambda side: int(side.stretch.t_ns[0]))):
         begin_at, end_at = before.anchor(-1), after.anchor(0)
         across_m = np.array(lengths_m(begin_at, end_at), dtype=np.float64)
         from_ns, to_ns = (np.full(across_m.size, anchor.t_ns, dtype=np.int64) for anchor in (begin_at, end_at))
-        ways.append((from_ns, to_ns, across_m, np.full(across_m.size, np.hypot(begin_at.sigma_m, end_at.sigma_m))))
-    begins, ends, lengths, sigmas = (np.concatenate(column) for column in zip(*ways, strict=True))
+        movements.append((from_ns, to_ns, across_m, np.full(across_m.size, np.hypot(begin_at.sigma_m, end_at.sigma_m))))
+    begins, ends, lengths, sigmas = (np.concatenate(column) for column in zip(*movements, strict=True))
     return begins, ends, lengths, sigmas
 
 
@@ -257,9 +261,9 @@ def shown_on_its_track(stretch: ReferenceStretch, config: Configuration) -> Bool
     proved = np.ones(stretch.t_ns.size, dtype=np.bool_)
     for path in stretch.paths:
         spare_m = config.evidence.track_spacing_m - config.hazards.evidence_factor * path.root_m
-        way_m = np.concatenate([[0.0], np.cumsum(np.abs(np.diff(path.at_m)))])
-        proved &= median_about(path.aside_m, way_m, config.evidence.survey_window_m) <= median_about(
-            spare_m, way_m, config.evidence.survey_window_m
+        run_m = np.concatenate([[0.0], np.cumsum(np.abs(np.diff(path.at_m)))])
+        proved &= median_along(path.aside_m, run_m, config.evidence.survey_window_m) <= median_along(
+            spare_m, run_m, config.evidence.survey_window_m
         )
     return proved
 
@@ -280,8 +284,8 @@ def read_anchors(
     ]
 
 
-def on_clock(anchors: Sequence[TrueAnchor], clock: RecorderClock, counter: Counter | None) -> list[TrueAnchor]:
-    """The reads on the odometer's clock, with what that clock may add at their speed; nothing without an odometer."""
+def on_clock(anchors: Sequence[TrueAnchor], clock: RecorderClock, counter: SignedOdometer | None) -> list[TrueAnchor]:
+    """Anchors on the odometer's clock, with what their own may add at their speed; nothing without an odometer."""
     t_ns = np.array([anchor.t_ns for anchor in anchors], dtype=np.int64)
     speed_mps = np.zeros(t_ns.size) if counter is None else np.abs(counter.odometer.speed_about(t_ns))
     clock_m = clock.delta_s * speed_mps

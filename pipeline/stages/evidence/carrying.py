@@ -41,21 +41,23 @@ class TrueAnchor:
 
 
 @frozen
-class Counter:
-    """An odometer as evidence, silent where its distance is in doubt by more than `silent_m`.
+class SignedOdometer:
+    """An odometer as evidence, that carries nothing where its distance is in doubt by more than `doubt_limit_m`.
 
     Without a sign (not `signed`: it counts up when the train goes back) also over a stand, which may hide a turn.
     """
 
     odometer: Odometry
-    silent_m: float = 0.0
+    doubt_limit_m: float = 0.0
     signed: bool = True
 
-    def without_sign(self) -> Counter:
+    def without_sign(self) -> SignedOdometer:
+        """The same, of a counter that counts up in both directions."""
         return replace(self, signed=False)
 
     @cached_property
     def _breaks_ns(self) -> Ints:
+        """Instants at which an odometer without sign may have changed its sense."""
         return np.zeros(0, dtype=np.int64) if self.signed else _stands_ns(self.odometer)
 
     @property
@@ -64,9 +66,14 @@ class Counter:
         return self.odometer.scale is not None
 
     def between(self, begin_ns: Ints | int, end_ns: Ints) -> OdometerDistance:
-        """True distance between instants, its variance and bound; NaN over a break."""
+        """True distance between instants, its variance and bound; NaN over a break.
+
+        Args:
+            begin_ns: instants from which, one or as many as `end_ns` [ns].
+            end_ns: instants to which [ns], shape (n,).
+        """
         counted = self.odometer.between(begin_ns, end_ns)
-        known = self._same(begin_ns, end_ns) & (counted.bound_m <= self.silent_m)
+        known = self._same(begin_ns, end_ns) & (counted.bound_m <= self.doubt_limit_m)
         return counted._replace(distance_m=np.where(known, counted.distance_m, np.nan))
 
     def distance_m(self, begin_ns: Ints | int, end_ns: Ints) -> Floats:
@@ -75,7 +82,7 @@ class Counter:
 
     @cached_property
     def rows(self) -> CounterRows:
-        """Its rows; a step of which anything is in doubt tells no way."""
+        """Its rows; a step of which anything is in doubt gives no distance."""
         odometer = self.odometer
         t_ns = odometer.epoch_ns + np.round(odometer.t_s * NS_PER_S).astype(np.int64)
         doubtful = np.concatenate([[0.0], np.cumsum(np.isnan(self.distance_m(t_ns[:-1], t_ns[1:])))])
@@ -96,11 +103,12 @@ class Counter:
         return np.where(near, held_ns, t_ns), np.where(near, beyond_m, 0.0)
 
     def _same(self, begin_ns: Ints | int, end_ns: Ints) -> Bools:
+        """Whether no break lies between the instants."""
         breaks = [np.searchsorted(self._breaks_ns, t_ns, side="right") for t_ns in (begin_ns, end_ns)]
         return np.asarray(breaks[0] == breaks[1])
 
     def driven_m(self, since_ns: Ints | int, t_ns: Ints) -> Floats:
-        """Way driven, turns included [m]."""
+        """Distance driven, turns included [m]."""
         travelled_at = self.odometer.travelled_at
         return np.asarray(np.abs(travelled_at(t_ns) - travelled_at(np.atleast_1d(since_ns))))
 
@@ -112,12 +120,12 @@ def _stands_ns(odometer: Odometry) -> Ints:
     return np.array((t_ns[first] + t_ns[np.minimum(last + 1, t_ns.size - 1)]) // 2, dtype=np.int64)
 
 
-def beside_m(driven_m: Floats, known_m: float, config: Configuration) -> Floats:
-    """Half the interval away from a place known to `known_m`: 5 m + 5 % of the way (SUBSET-041 5.3.1.1)."""
+def odometer_confidence_m(driven_m: Floats, known_m: float, config: Configuration) -> Floats:
+    """Half the interval away from a place known to `known_m`: 5 m + 5 % of the distance run (SUBSET-041 5.3.1.1)."""
     return np.asarray(max(config.lds.odometer_fixed_m, known_m) + config.lds.odometer_share * driven_m)
 
 
-def _doubt_m(counter: Counter, anchor: TrueAnchor, t_ns: Ints) -> Floats:
+def _doubt_m(counter: SignedOdometer, anchor: TrueAnchor, t_ns: Ints) -> Floats:
     """What the anchor's clock, and steps, may add at some instants: by the speed there or at the anchor [m]."""
     if anchor.delta_s == 0.0:
         return np.full(t_ns.size, anchor.clock_m)
@@ -125,14 +133,14 @@ def _doubt_m(counter: Counter, anchor: TrueAnchor, t_ns: Ints) -> Floats:
     return np.asarray(np.maximum(there_m, anchor.clock_m))
 
 
-def carried(counter: Counter, anchor: TrueAnchor, at_m: float, t_ns: Ints, config: Configuration) -> Interval:
-    """On one side of an anchor at `at_m`; the fixed 5 m hold what may be off at the anchor itself."""
+def carried(counter: SignedOdometer, anchor: TrueAnchor, at_m: float, t_ns: Ints, config: Configuration) -> Interval:
+    """The interval on one side of an anchor at `at_m`; the fixed 5 m hold what may be off at the anchor itself."""
     known_m = config.hazards.evidence_factor * anchor.sigma_m + _doubt_m(counter, anchor, t_ns)
     return _carried_from(counter, anchor.t_ns, at_m, t_ns, np.maximum(known_m, config.lds.odometer_fixed_m), config)
 
 
 def _carried_from(
-    counter: Counter,
+    counter: SignedOdometer,
     since_ns: Ints | int,
     at_m: Floats | float,
     t_ns: Ints,
@@ -140,14 +148,14 @@ def _carried_from(
     config: Configuration,
 ) -> Interval:
     """Places at some instants, known to `known_m`, plus the distance since, +- (5 % + bound)."""
-    way = counter.between(since_ns, t_ns)
-    centre = at_m + way.distance_m
-    half = known_m + config.lds.odometer_share * counter.driven_m(since_ns, t_ns) + way.bound_m
+    distance = counter.between(since_ns, t_ns)
+    centre = at_m + distance.distance_m
+    half = known_m + config.lds.odometer_share * counter.driven_m(since_ns, t_ns) + distance.bound_m
     return centre - half, centre + half
 
 
 def between_anchors(
-    counter: Counter,
+    counter: SignedOdometer,
     anchors: tuple[TrueAnchor, TrueAnchor],
     at_m: tuple[float, float],
     t_ns: Ints,
@@ -157,13 +165,13 @@ def between_anchors(
 
     Where the odometer of a vehicle file closes, the inverse-variance mean of both +- (k sigmas + closing error), as the
     whole closing error may have arisen at one place. Else the hull of both. Each is wider by its own bound; where
-    the gap closes with it and the less doubtful anchor alone tells more, it does.
+    the gap closes with it and the less doubtful anchor alone is narrower, that counts.
     """
     factor = config.hazards.evidence_factor
     clock_m = [_doubt_m(counter, anchor, t_ns) for anchor in anchors]
-    ways = [counter.between(anchor.t_ns, t_ns) for anchor in anchors]
-    places = [at + way.distance_m for at, way in zip(at_m, ways, strict=True)]
-    variances = [anchor.sigma_m**2 + way.variance_m2 for anchor, way in zip(anchors, ways, strict=True)]
+    distances = [counter.between(anchor.t_ns, t_ns) for anchor in anchors]
+    places = [at + distance.distance_m for at, distance in zip(at_m, distances, strict=True)]
+    variances = [anchor.sigma_m**2 + distance.variance_m2 for anchor, distance in zip(anchors, distances, strict=True)]
     closed = closes(counter, anchors, at_m[1] - at_m[0], config)
     if counter.by_file and closed:
         weights = [1.0 / variance for variance in variances]
@@ -171,49 +179,51 @@ def between_anchors(
         centre = share * places[0] + (1.0 - share) * places[1]
         # The two places differ by the closing error at every instant.
         half = factor / np.sqrt(weights[0] + weights[1]) + np.abs(places[0] - places[1])
-        half += share * (clock_m[0] + ways[0].bound_m) + (1.0 - share) * (clock_m[1] + ways[1].bound_m)
+        half += share * (clock_m[0] + distances[0].bound_m) + (1.0 - share) * (clock_m[1] + distances[1].bound_m)
         together = centre - half, centre + half
-        return _narrower(together, counter, anchors, at_m, t_ns, ways, config)
+        return _narrower(together, counter, anchors, at_m, t_ns, distances, config)
     halves = [
-        factor * np.sqrt(variance) + added_m + way.bound_m
-        for variance, added_m, way in zip(variances, clock_m, ways, strict=True)
+        factor * np.sqrt(variance) + added_m + distance.bound_m
+        for variance, added_m, distance in zip(variances, clock_m, distances, strict=True)
     ]
     low = np.minimum(places[0] - halves[0], places[1] - halves[1])
     hull = low, np.maximum(places[0] + halves[0], places[1] + halves[1])
     # What does not close is not explained by the known doubts: it may have been lost anywhere between.
-    return _narrower(hull, counter, anchors, at_m, t_ns, ways, config) if closed else hull
+    return _narrower(hull, counter, anchors, at_m, t_ns, distances, config) if closed else hull
 
 
 def _narrower(
     together: Interval,
-    counter: Counter,
+    counter: SignedOdometer,
     anchors: tuple[TrueAnchor, TrueAnchor],
     at_m: tuple[float, float],
     t_ns: Ints,
-    ways: list[OdometerDistance],
+    distances: list[OdometerDistance],
     config: Configuration,
 ) -> Interval:
-    """By both anchors together, or by the one from which less is in doubt, where that is narrower."""
-    doubtful = (ways[0].bound_m > 0.0) | (ways[1].bound_m > 0.0)
+    """The interval of both anchors together, or that of the less doubtful one, whichever is narrower."""
+    doubtful = (distances[0].bound_m > 0.0) | (distances[1].bound_m > 0.0)
     if not doubtful.any():
         return together
     first, second = (carried(counter, anchor, at, t_ns, config) for anchor, at in zip(anchors, at_m, strict=True))
-    by_first = ways[0].bound_m <= ways[1].bound_m
+    by_first = distances[0].bound_m <= distances[1].bound_m
     low_m, high_m = (np.where(by_first, *pair) for pair in zip(first, second, strict=True))
     alone = doubtful & ~(together[1] - together[0] <= high_m - low_m)
     return np.where(alone, low_m, together[0]), np.where(alone, high_m, together[1])
 
 
-def closes(counter: Counter, anchors: tuple[TrueAnchor, TrueAnchor], apart_m: float, config: Configuration) -> bool:
-    """The odometer's way is the anchors' distance: within k roots, without a vehicle file within 5 m + 5 %."""
+def closes(
+    counter: SignedOdometer, anchors: tuple[TrueAnchor, TrueAnchor], apart_m: float, config: Configuration
+) -> bool:
+    """The odometer's distance is that of the anchors: within k roots, without a vehicle file within 5 m + 5 %."""
     begin, end = anchors
     end_ns = np.array([end.t_ns])
-    way = counter.between(begin.t_ns, end_ns)
-    root = np.sqrt(begin.sigma_m**2 + end.sigma_m**2 + way.variance_m2)
+    distance = counter.between(begin.t_ns, end_ns)
+    root = np.sqrt(begin.sigma_m**2 + end.sigma_m**2 + distance.variance_m2)
     limit = config.hazards.evidence_factor * root
     if not counter.by_file:
-        limit = beside_m(counter.driven_m(begin.t_ns, end_ns), 0.0, config)
-    return bool((np.abs(apart_m - way.distance_m) <= limit + way.bound_m)[0])
+        limit = odometer_confidence_m(counter.driven_m(begin.t_ns, end_ns), 0.0, config)
+    return bool((np.abs(apart_m - distance.distance_m) <= limit + distance.bound_m)[0])
 
 
 def carried_forward(
@@ -221,24 +231,24 @@ def carried_forward(
     path_m: Floats,
     t_ns: Ints,
     odometer: Odometry,
-    stood: Sequence[tuple[int, int]],
+    standstills: Sequence[tuple[int, int]],
     config: Configuration,
 ) -> Interval:
     """Path position of the train: the last accepted balise, plus the distance since, +- (5 m + 5 %).
 
-    NaN before the first balise, over a break and over a stand in `stood`. `accepted_ns` in order, at `path_m` of the
-    solution's own path, with which the odometer grows.
+    NaN before the first balise, over a break and over a stand of `standstills`. `accepted_ns` in order, at `path_m` of
+    the solution's own path, with which the odometer grows.
     """
-    counter = Counter(odometer, config.hazards.limits.doubt_m)
+    counter = SignedOdometer(odometer, config.hazards.limits.doubt_m)
     used = _consistent(accepted_ns, path_m, counter, config)
     low, high = np.full((2, t_ns.size), np.nan)
     if used.size:
         last = np.searchsorted(accepted_ns[used], t_ns, side="right") - 1
         rows = np.flatnonzero(last >= 0)
         since = used[last[rows]]
-        # A stand between balise and instant: the wheel may have stood while the train ran.
+        # A stand between balise and instant: the wheel may have stood still while the train ran.
         over_stand = np.zeros(rows.size, dtype=np.bool_)
-        for begin_ns, end_ns in stood:
+        for begin_ns, end_ns in standstills:
             over_stand |= (t_ns[rows] >= begin_ns) & (accepted_ns[since] <= end_ns)
         fixed_m = config.lds.odometer_fixed_m
         interval = _carried_from(counter, accepted_ns[since], path_m[since], t_ns[rows], fixed_m, config)
@@ -246,15 +256,16 @@ def carried_forward(
     return low, high
 
 
-def _consistent(accepted_ns: Ints, path_m: Floats, counter: Counter, config: Configuration) -> Ints:
+def _consistent(accepted_ns: Ints, path_m: Floats, counter: SignedOdometer, config: Configuration) -> Ints:
     """Accepted balises that agree, within the failure limit, with the odometer since the last one that did."""
     limit_m = config.hazards.limits.agreement_m
 
     def agree(before: Ints, here: Ints) -> Bools:
+        """Whether each balise `here` lies where the odometer leads from the one `before`, within the limit."""
         fixed_m = config.lds.odometer_fixed_m
         low, high = _carried_from(counter, accepted_ns[before], path_m[before], accepted_ns[here], fixed_m, config)
         at_m = path_m[here]
-        # Where the odometer tells nothing it contradicts nothing.
+        # Where the odometer knows nothing it contradicts nothing.
         return np.asarray(~((at_m < low - limit_m) | (at_m > high + limit_m)))
 
     known = np.flatnonzero(counter.odometer.known_at(accepted_ns))
@@ -291,10 +302,11 @@ class RecorderClock:
 
 @frozen
 class Lags:
-    """What the ways of a recorder say of its lag behind one odometer: `found`, and the least and largest `possible_s`.
+    """What the movements of a recorder say of its lag behind one odometer: `found`, and the least and largest
+    `possible_s`.
 
-    `found`: one of the run, or two where its halves disagree. `possible_s`: what the ways do not refute where none is
-    measured and they refute that there is none; None where there may be none, or they say nothing of it.
+    `found`: one of the run, or two where its halves disagree. `possible_s`: what the movements do not refute where none
+    is measured and they refute that there is none; None where there may be none, or they say nothing of it.
     """
 
     found: tuple[ScaleLag, ...] = ()
@@ -335,24 +347,29 @@ def clock_of(lags: Sequence[Lags], independent: bool, config: HazardConfig) -> R
     return RecorderClock(0.5 * (low_s + high_s), max(0.5 * (high_s - low_s), least_s), assumed=not independent)
 
 
-def clocks_of(
-    lags: tuple[Sequence[Lags], Sequence[Lags]], independent: bool, config: HazardConfig
-) -> tuple[RecorderClock, RecorderClock]:
-    """Those of reference and reads. One that cannot be measured may have the odometer's clock or that of the other."""
-    first, second = (clock_of(of_one, independent, config) for of_one in lags)
-    return _toward_measured_clock(first, second, config), _toward_measured_clock(second, first, config)
+def clocks_of(lags: Sequence[Sequence[Lags]], independent: bool, config: HazardConfig) -> list[RecorderClock]:
+    """One for each recorder. One that cannot be measured may have the odometer's clock or that of any other."""
+    clocks = [clock_of(of_one, independent, config) for of_one in lags]
+    return [
+        _toward_measured_clocks(clock, [*clocks[:number], *clocks[number + 1 :]], config)
+        for number, clock in enumerate(clocks)
+    ]
 
 
-def _toward_measured_clock(clock: RecorderClock, other: RecorderClock, config: HazardConfig) -> RecorderClock:
-    if not clock.assumed or other.shift_s == 0.0:
+def _toward_measured_clocks(
+    clock: RecorderClock, others: Sequence[RecorderClock], config: HazardConfig
+) -> RecorderClock:
+    shifts_s = [0.0, *(other.shift_s for other in others)]
+    low_s, high_s = min(shifts_s), max(shifts_s)
+    if not clock.assumed or low_s == high_s:
         return clock
-    middle_s = 0.5 * other.shift_s
-    delta_s = abs(clock.shift_s - middle_s) + abs(middle_s) + config.evidence_clock_s
+    middle_s = 0.5 * (low_s + high_s)
+    delta_s = abs(clock.shift_s - middle_s) + 0.5 * (high_s - low_s) + config.evidence_clock_s
     return RecorderClock(middle_s, delta_s, assumed=True)
 
 
 def true_clocks_s(clocks: Sequence[RecorderClock]) -> tuple[float, ...]:
-    """By how much the odometer's stamps may be early, least to largest [s]: a measured lag belongs to nobody.
+    """How early the odometer's stamps may be, least to largest [s]: a measured lag belongs to nobody.
 
     If a recorder has it the odometer's own stamps are true, else odometer and GNSS share it, and what the odometer
     stamped one lag before is true: that of any recorder, and all between.
@@ -371,35 +388,35 @@ def _measured(lag: ScaleLag, config: HazardConfig) -> bool:
 
 
 def lags_of(
-    begin_ns: Ints, end_ns: Ints, way_m: Floats, sigma_m: Floats, counter: Counter, config: Configuration
+    begin_ns: Ints, end_ns: Ints, moved_m: Floats, sigma_m: Floats, counter: SignedOdometer, config: Configuration
 ) -> Lags:
-    """The lag of a recorder by the ways that it saw between its stamps, positive as the odometer counts up.
+    """The lag of a recorder by the movements that it saw between its stamps, positive as the odometer counts up.
 
     A clock that changes in the middle of a run, at a stand or after a restart, has no lag of the run. `sigma_m`: of a
-    way by the recorder's own noise.
+    movement by the recorder's own noise.
     """
     order = begin_ns.argsort(kind="stable")
     begin_ns, end_ns = begin_ns[order], end_ns[order]
-    way_m, sigma_m = way_m[order], sigma_m[order]
+    moved_m, sigma_m = moved_m[order], sigma_m[order]
     begin_s, end_s = (counter.odometer.seconds(t_ns) for t_ns in (begin_ns, end_ns))
     half = begin_ns.size // 2
     halves = [
-        scale_and_lag(begin_s[part], end_s[part], way_m[part], counter.rows)
+        scale_and_lag(begin_s[part], end_s[part], moved_m[part], counter.rows)
         for part in (slice(half), slice(half, None))
     ]
     apart_sigma_s = float(np.hypot(halves[0].lag_sigma_s, halves[1].lag_sigma_s))
     if abs(halves[0].lag_s - halves[1].lag_s) > _DIFFER_SIGMAS * apart_sigma_s:
         return Lags(tuple(halves))
-    found = scale_and_lag(begin_s, end_s, way_m, counter.rows)
+    found = scale_and_lag(begin_s, end_s, moved_m, counter.rows)
     if _measured(found, config.hazards):
         return Lags((found,))
-    # Ways that follow one another share the noise of the place between them: together as if each had twice its
+    # Movements that follow one another share the noise of the place between them: together as if each had twice its
     # variance.
     variance_m2 = 2.0 * sigma_m**2 + np.nan_to_num(counter.between(begin_ns, end_ns).variance_m2)
     factor = config.hazards.evidence_factor
     scale_off = factor * (counter.odometer.scale_sigma or 0.0) if counter.by_file else config.lds.odometer_share
-    ways = (begin_s, end_s, way_m)
-    low_s, high_s = possible_lags(ways, counter.rows, np.sqrt(variance_m2), scale_off, _SHOWN_SIGMAS) or (0.0, 0.0)
+    movements = (begin_s, end_s, moved_m)
+    low_s, high_s = possible_lags(movements, counter.rows, np.sqrt(variance_m2), scale_off, _SHOWN_SIGMAS) or (0.0, 0.0)
     if low_s <= 0.0 <= high_s:
         return Lags((found,))
-    return Lags((found,), possible_lags(ways, counter.rows, np.sqrt(variance_m2), scale_off, factor))
+    return Lags((found,), possible_lags(movements, counter.rows, np.sqrt(variance_m2), scale_off, factor))

@@ -10,8 +10,8 @@ from typing import Self
 import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 
-from pipeline.stages.evidence.carrying import Counter, Lags, clock_of
-from pipeline.stages.odometry.polarity import sense_of_ways
+from pipeline.stages.evidence.carrying import Lags, SignedOdometer, clock_of
+from pipeline.stages.odometry.polarity import relative_sense
 from pipeline.stages.odometry.regression import ScaleLag
 from pipeline.stages.reference import ReferencePath, ReferenceStretch
 from pipeline.stages.track.path import Place
@@ -46,11 +46,12 @@ class KnownPath:
     step_m: Floats
 
     def part(self, rows: slice) -> KnownPath:
-        """Of some samples."""
+        """The same, of some samples only."""
         arrays = {name: getattr(self, name)[rows] for name in ("at_m", "low_m", "high_m", "step_m")}
         return replace(self, path=self.path.part(rows), **arrays)
 
     def place(self, sample: int) -> Place:
+        """Net element and measure of one sample."""
         element, measure, _ = self.path.legs[int(self.path.leg[sample])].locate(self.at_m[[sample]])
         return Place(int(element[0]), float(measure[0]))
 
@@ -88,20 +89,22 @@ class Witness:
     `scale_sigma`: true over counted distance where no vehicle file gives it.
     """
 
-    counter: Counter
+    counter: SignedOdometer
     lag_s: float = 0.0
     clock_s: float = 0.0
     scale: float = 1.0
     scale_sigma: float = 0.0
 
     @classmethod
-    def of(cls, counter: Counter, lags: Lags, config: Configuration) -> Self:
+    def of(cls, counter: SignedOdometer, lags: Lags, config: Configuration) -> Self:
         """Scale by the vehicle file, else as measured with the lag, else within 5 % (SUBSET-041 5.3.1.1)."""
         factor = config.hazards.evidence_factor
         share = config.lds.odometer_share
         clock = clock_of([lags], independent=True, config=config.hazards)
         if counter.by_file:
-            return cls(counter, clock.shift_s, clock.delta_s)  # the variance of a way holds that of the file's scale
+            return cls(
+                counter, clock.shift_s, clock.delta_s
+            )  # the variance of a distance holds that of the file's scale
         best = min(lags.found, key=lambda lag: lag.scale_sigma, default=ScaleLag())
         if factor * best.scale_sigma < share:
             return cls(counter, clock.shift_s, clock.delta_s, best.scale, best.scale_sigma)
@@ -158,7 +161,7 @@ def _drifts(
 ) -> list[ReferenceStep]:
     """Windows that an odometer contradicts beyond `explained_m` of steps.
 
-    `window`: length, first begin [s], and what an odometer may be off whatever it counted [m]. Beside one that is
+    `window`: length, first begin [s], and what an odometer may be off whatever it counted [m]. Next to one that is
     contradicted the reference may have drifted already, or still, where no odometer counted.
     """
     t_ns = stretch.t_ns
@@ -204,6 +207,7 @@ class Levels:
 
     @classmethod
     def of(cls, steps: Sequence[ReferenceStep], t_ns: Ints, reads_ns: Sequence[int]) -> Levels:
+        """The levels between steps of a reference; reads confirm those that they lie in."""
         lasting, spikes = _without_spikes(steps, t_ns)
         heard = np.searchsorted(t_ns, np.array(reads_ns, dtype=np.int64))
         begins = [(step.sample + 1, step.step_m, step.span is not None) for step in lasting]
@@ -219,8 +223,8 @@ class Levels:
         drifts = np.array([False, *(drift for _, _, drift in begins)])
         return cls(tuple(rows), heights_m, confirmed, drifts, tuple(spikes))
 
-    def seen(self, sense: int) -> Levels:
-        """As the odometer counts up, or back along the path."""
+    def oriented(self, sense: int) -> Levels:
+        """The levels as the odometer counts up, or back along the path."""
         return replace(self, heights_m=sense * self.heights_m)
 
     @property
@@ -244,8 +248,8 @@ class Beyond:
     before_m: tuple[float, ...] = ()
     after_m: tuple[float, ...] = ()
 
-    def seen(self, sense: int) -> Beyond:
-        """As the odometer counts up, or back along the path."""
+    def oriented(self, sense: int) -> Beyond:
+        """The levels as the odometer counts up, or back along the path."""
         return Beyond(tuple(sense * m for m in self.before_m), tuple(sense * m for m in self.after_m))
 
 
@@ -302,7 +306,7 @@ def _possible_m(levels: Levels, number: int, beyond: Beyond) -> Floats:
 
 
 def levels_beyond(stretches: Sequence[Levels], steps_m: Sequence[float]) -> list[Beyond]:
-    """For each stretch the levels on both sides of it; `steps_m`: of the reference in the gaps between them."""
+    """The levels on both sides of each stretch; `steps_m`: of the reference in the gaps between them."""
     reversed_steps = [-step_m for step_m in reversed(steps_m)]
     before = _behind(stretches, steps_m, back=False)
     after = _behind(stretches[::-1], reversed_steps, back=True)[::-1]
@@ -310,11 +314,11 @@ def levels_beyond(stretches: Sequence[Levels], steps_m: Sequence[float]) -> list
 
 
 def _behind(stretches: Sequence[Levels], steps_m: Sequence[float], back: bool) -> list[list[float]]:
-    """For each stretch, in this order, the levels of those before it, over its near end [m]."""
+    """The levels of all stretches before each, in this order, over its near end [m]."""
     behind: list[list[float]] = []
-    met: list[float] = []
+    seen_levels_m: list[float] = []
     for number, levels in enumerate(stretches):
-        behind.append(list(met))
+        behind.append(list(seen_levels_m))
         if number == len(steps_m):
             break
         heights_m = levels.heights_m[::-1] if back else levels.heights_m
@@ -325,10 +329,10 @@ def _behind(stretches: Sequence[Levels], steps_m: Sequence[float], back: bool) -
         if confirmed.any():
             # What lies before a confirmed level says nothing here.
             own_m = heights_m[int(np.flatnonzero(confirmed)[-1]) :] - heights_m[-1]
-            met = []
+            seen_levels_m = []
         rise_m = levels.rise_m * (-1.0 if back else 1.0)
-        met = [height_m - rise_m - steps_m[number] for height_m in met]
-        met += (own_m - steps_m[number]).tolist()
+        seen_levels_m = [height_m - rise_m - steps_m[number] for height_m in seen_levels_m]
+        seen_levels_m += (own_m - steps_m[number]).tolist()
     # A reference without any step, and without a gap that does not close, leaves nothing open.
     return [list(dict.fromkeys(heights_m)) for heights_m in behind]
 
@@ -342,7 +346,7 @@ def _without_spikes(
     for step in steps:
         before = lasting[-1] if lasting else None
         soon = before is not None and int(t_ns[step.sample] - t_ns[before.sample]) <= round(_WINDOW_S * NS_PER_S)
-        # A leap that ends a standstill is no way back from it.
+        # A leap that ends a standstill is no return from it.
         soon = soon and before is not None and before.leap == step.leap
         if before is not None and soon and abs(before.step_m + step.step_m) <= np.hypot(before.noise_m, step.noise_m):
             spikes.append((before, step))
@@ -359,8 +363,8 @@ def _unexplained_m(at_m: Floats, t_ns: Ints, least_m: Floats) -> Floats:
     """
     dt_s = np.diff(t_ns) / NS_PER_S
     speed_mps = np.diff(at_m) / dt_s
-    beside = max(1, round(EVEN_S / float(np.median(dt_s))))
-    around = sliding_window_view(np.pad(speed_mps, beside, mode="edge"), 2 * beside + 1)
+    reach = max(1, round(EVEN_S / float(np.median(dt_s))))
+    around = sliding_window_view(np.pad(speed_mps, reach, mode="edge"), 2 * reach + 1)
     # A median lies among its values: far from it lie few.
     farthest_mps = np.maximum(around.max(axis=1) - speed_mps, speed_mps - around.min(axis=1))
     rows = np.flatnonzero(farthest_mps * dt_s > least_m)
@@ -370,7 +374,7 @@ def _unexplained_m(at_m: Floats, t_ns: Ints, least_m: Floats) -> Floats:
 
 
 def _undrivable_m(known: KnownPath, stretch: ReferenceStretch, config: Configuration) -> tuple[Floats, Floats]:
-    """Per step of the reference how far it leads beyond what a train can drive, 0 where it may; and what is allowed."""
+    """How far each step of the reference leads beyond what a train can drive, else 0; and what is allowed."""
     dt_s = np.diff(stretch.t_ns) / NS_PER_S
     root_m = np.hypot(stretch.sigma_m[1:], stretch.sigma_m[:-1])
     driven_m = config.align.braking_mps2 * np.maximum(dt_s, EVEN_S) * dt_s
@@ -383,17 +387,17 @@ def _contradicted(
     known: KnownPath,
     stretch: ReferenceStretch,
     witnesses: Sequence[Witness],
-    ways: tuple[Ints, Ints],
+    pairs: tuple[Ints, Ints],
     explained_m: Floats,
     config: Configuration,
 ) -> tuple[Floats, Floats]:
-    """Per way between samples: its difference, less what is explained, from the odometer that contradicts it most [m].
+    """Per pair of samples: its difference, less what is explained, from the odometer that contradicts it most [m].
 
-    And what is allowed: k_T sigmas, the clock at a change of speed, and what the odometer itself doubts of its way.
-    `stretch`: with the stamps of the reference; each is compared at the lag that was measured.
+    And what is allowed: k_T sigmas, the clock at a change of speed, and what the odometer itself doubts of its
+    distance. `stretch`: with the stamps of the reference; each is compared at the lag that was measured.
     """
-    begin, end = ways
-    way_m = known.at_m[end] - known.at_m[begin]
+    begin, end = pairs
+    moved_m = known.at_m[end] - known.at_m[begin]
     speed_mps = path_speed_mps(stretch.t_ns, known.at_m, known.path.leg)
     change_mps = np.abs(speed_mps[end] - speed_mps[begin])
     rest_m = np.zeros(begin.size)
@@ -402,17 +406,17 @@ def _contradicted(
     whole = known.path.leg[begin] == known.path.leg[end]
     for number, witness in enumerate(witnesses):
         t_ns = stretch.t_ns - round(witness.lag_s * NS_PER_S)
-        way = witness.counter.between(t_ns[begin], t_ns[end])
-        # Others may count the other way round.
+        distance = witness.counter.between(t_ns[begin], t_ns[end])
+        # Others may count with the other sign.
         least_m = config.matching.orientation_distance_m
-        sense = sense_of_ways(way.distance_m, way_m, least_m) if number else known.sense
-        counted_m = sense * witness.scale * way.distance_m
+        sense = relative_sense(distance.distance_m, moved_m, least_m) if number else known.sense
+        counted_m = sense * witness.scale * distance.distance_m
         if not witness.counter.signed:
-            counted_m = np.where(way_m * counted_m < 0.0, -counted_m, counted_m)
-        variance_m2 = stretch.sigma_m[end] ** 2 + stretch.sigma_m[begin] ** 2 + way.variance_m2
-        root_m = np.sqrt(variance_m2 + (witness.scale_sigma * way.distance_m) ** 2)
-        limit_m = config.align.sure_sigmas * root_m + witness.clock_s * change_mps + way.bound_m
-        off_m = way_m - counted_m - explained_m
+            counted_m = np.where(moved_m * counted_m < 0.0, -counted_m, counted_m)
+        variance_m2 = stretch.sigma_m[end] ** 2 + stretch.sigma_m[begin] ** 2 + distance.variance_m2
+        root_m = np.sqrt(variance_m2 + (witness.scale_sigma * distance.distance_m) ** 2)
+        limit_m = config.align.sure_sigmas * root_m + witness.clock_s * change_mps + distance.bound_m
+        off_m = moved_m - counted_m - explained_m
         beyond_m = np.abs(off_m) - limit_m
         more = whole & np.isfinite(beyond_m) & (beyond_m > excess_m)
         rest_m = np.where(more, off_m, rest_m)
@@ -421,23 +425,23 @@ def _contradicted(
     return rest_m, allowed_m
 
 
-def median_about(values: Floats, way_m: Floats, window_m: float) -> Floats:
-    """Median over `window_m` of the way about each sample, taken every quarter of it; over 5 samples at least."""
+def median_along(values: Floats, distance_m: Floats, window_m: float) -> Floats:
+    """Median over `window_m` of the distance about each sample, taken every quarter of it; over 5 samples at least."""
     if not np.any(values != values[:1]):
         return values
-    places_m = np.arange(way_m[0], way_m[-1] + 0.25 * window_m, 0.25 * window_m)
-    first = np.searchsorted(way_m, places_m - 0.5 * window_m)
-    last = np.searchsorted(way_m, places_m + 0.5 * window_m, side="right")
+    places_m = np.arange(distance_m[0], distance_m[-1] + 0.25 * window_m, 0.25 * window_m)
+    first = np.searchsorted(distance_m, places_m - 0.5 * window_m)
+    last = np.searchsorted(distance_m, places_m + 0.5 * window_m, side="right")
     short = np.maximum(_FEWEST_IN_WINDOW - (last - first), 0)
     first = np.maximum(first - short, 0)
     last = np.minimum(last + short, values.size)
     medians = [_median(values[low:high]) for low, high in zip(first.tolist(), last.tolist(), strict=True)]
-    nearest = np.rint((way_m - way_m[0]) / (0.25 * window_m)).astype(np.int64).clip(0, places_m.size - 1)
+    nearest = np.rint((distance_m - distance_m[0]) / (0.25 * window_m)).astype(np.int64).clip(0, places_m.size - 1)
     return np.asarray(np.array(medians)[nearest])
 
 
 def _median(values: Floats) -> float:
-    """As `np.median` of finite values, ten times faster for as few as lie in a window."""
+    """The median of finite values, ten times faster than `np.median` for as few as lie in a window."""
     half = values.size // 2
     ordered = np.partition(values, (half - 1, half) if values.size > 1 else half)
     return ordered.item(half) if values.size % 2 else 0.5 * (ordered.item(half - 1) + ordered.item(half))

@@ -9,7 +9,7 @@ from functools import cached_property
 import numpy as np
 
 from pipeline.stages.evidence.anchors import KnownStretch, Stand, still_standing
-from pipeline.stages.evidence.carrying import Counter, Interval, RecorderClock, between_anchors, carried
+from pipeline.stages.evidence.carrying import Interval, RecorderClock, SignedOdometer, between_anchors, carried
 from pipeline.stages.evidence.contradictions import KnownPath
 from pipeline.stages.evidence.gaps import Carried, Gap, GapChain
 from pipeline.stages.track.network import Network
@@ -39,22 +39,24 @@ class Alternative:
 
     @property
     def middle_m(self) -> Floats:
+        """Middle of the interval at each instant [m]."""
         return 0.5 * (self.low_m + self.high_m)
 
     def where(self, kept: Bools | Ints | slice) -> Alternative:
-        """At some of its instants only."""
+        """The alternative at some of its instants only."""
         return Alternative(self.rows[kept], self.route, self.low_m[kept], self.high_m[kept])
 
     def over(self, first: int, last: int) -> Alternative:
-        """At its rows from one to another one, both included."""
+        """The alternative at its rows from one to another, both included."""
         return self.where(slice(*np.searchsorted(self.rows, [first, last + 1]).tolist()))
 
     def loosened(self, slack_m: Floats) -> Alternative:
-        """By so much more at each instant, on both sides."""
+        """The alternative, wider on both sides by a length at each instant."""
         slack_m = slack_m[self.rows]
         return Alternative(self.rows, self.route, self.low_m - slack_m, self.high_m + slack_m)
 
     def widened(self, factor: float) -> Alternative:
+        """The alternative, its intervals so many times as wide."""
         half_m = 0.5 * factor * (self.high_m - self.low_m)
         return Alternative(self.rows, self.route, self.middle_m - half_m, self.middle_m + half_m)
 
@@ -86,24 +88,24 @@ class _Shown:
 class TrainEvidence:
     """All evidence of a run.
 
-    `silent`: times with reference samples that lie on no track. `carried`: by each odometer from reads and the ends of
-    the reference, outside its time; `by_reads`: from reads alone, over the whole run. `stood`: times over which the
-    odometer carries nothing from one side. `stands`: ends of recordings at which the train stood; `parted`: an odometer
-    of unknown origin parts from an independent one; `doubted`: steps and drifts of the reference that an odometer
-    or a read contradicts, and clocks that change; `unsure`: times in which nobody knows which of the two failed;
-    `disputes`: times about reads that exclude the reference; `true_clocks_s`: by how much the odometer's stamps may be
-    early.
+    `off_track`: times with reference samples that lie on no track. `carried`: by each odometer from reads and the ends
+    of the reference, outside its time; `by_reads`: from reads alone, over the whole run. `standstills`: times over
+    which the odometer carries nothing from one side. `stands`: ends of recordings at which the train stood; `parted`:
+    an odometer of unknown origin parts from an independent one; `doubted`: steps and drifts of the reference that an
+    odometer or a read contradicts, and clocks that change; `unsure`: times in which nobody knows which of the two
+    failed; `disputes`: times about reads that exclude the reference; `true_clocks_s`: by how much the odometer's stamps
+    may be early.
     """
 
     stretches: tuple[KnownStretch, ...]
-    silent: tuple[Span, ...]
+    off_track: tuple[Span, ...]
     carried: tuple[Carried, ...]
     by_reads: tuple[Carried, ...]
     reads_ns: Ints
     clocks: tuple[RecorderClock, ...]
     network: Network
     config: Configuration
-    stood: tuple[Span, ...] = ()
+    standstills: tuple[Span, ...] = ()
     stands: tuple[Stand, ...] = ()
     parted: bool = False
     doubted: int = 0
@@ -113,14 +115,14 @@ class TrainEvidence:
 
     @property
     def gaps(self) -> tuple[Gap, ...]:
-        """Those of the odometer of the LDS."""
+        """The gaps of the odometer that the LDS uses."""
         return self.carried[0].gaps if self.carried else ()
 
     @property
     def contradicted(self) -> int:
-        """Gaps between anchors whose length by the odometer, scaled by the vehicle file, fits no way on the track."""
+        """Gaps between anchors whose length by the odometer, scaled by the vehicle file, fits no route on the track."""
         by_file = bool(self.carried) and self.carried[0].counter.by_file
-        return sum(bool(gap.ways) and len(gap.anchors) == 2 and not gap.closed for gap in self.gaps if by_file)
+        return sum(bool(gap.routes) and len(gap.anchors) == 2 and not gap.closed for gap in self.gaps if by_file)
 
     @property
     def unreachable(self) -> int:
@@ -167,12 +169,19 @@ class TrainEvidence:
     def at(self, t_ns: Ints) -> EvidenceSet:
         """Evidence at these instants of the GNSS's stamps, whichever of the clocks is the true one.
 
-        Nothing is carried from one side over a stand of the odometer (`stood`). Up to a second after a recording that
-        ended in a stand the train is taken to stand on.
+        Nothing is carried from one side over a stand of the odometer (`standstills`). Up to a second after a recording
+        that ended in a stand the train is taken to stand on.
+
+        Args:
+            t_ns: instants in any order [ns], shape (n,).
+
+        Returns:
+            Net elements and intervals at each of them.
         """
         return either([self._by_clock(t_ns, early_s) for early_s in self.true_clocks_s])
 
     def _by_clock(self, t_ns: Ints, early_s: float) -> EvidenceSet:
+        """Where the train may be, widened by what it moves within an uncertainty of the clock."""
         at_ns, beyond_m = t_ns, np.zeros(t_ns.size)
         if early_s and self.carried:
             at_ns, beyond_m = self.carried[0].counter.within(t_ns - round(early_s * NS_PER_S), abs(early_s))
@@ -183,11 +192,12 @@ class TrainEvidence:
         return replace(found, alternatives=widened) if slack_m.any() else found
 
     def _at(self, t_ns: Ints) -> EvidenceSet:
+        """Where the train may be at instants, as the clock of the evidence stamps them."""
         instants = _Instants(t_ns)
         kind = np.full(t_ns.size, NOTHING)
         proves, on_survey = np.zeros((2, t_ns.size), dtype=np.bool_)
         shown = _Shown(kind, proves, on_survey)
-        on_track = ~within_spans(t_ns, self.silent)
+        on_track = ~within_spans(t_ns, self.off_track)
         heard = on_track & ~within_spans(t_ns, self.unsure)
         alternatives = self._covered(instants, heard, shown)
         alternatives += self._carried(self.carried, instants, heard & (kind == NOTHING), shown)
@@ -208,7 +218,7 @@ class TrainEvidence:
         return EvidenceSet(kind, tuple(alternatives), proves, on_survey | (complete & (kind != NOTHING)))
 
     def _covered(self, instants: _Instants, heard: Bools, shown: _Shown, beyond: bool = False) -> list[Alternative]:
-        """By the reference; writes into `shown` where it speaks. `beyond`: past its ends as far as its clock may be."""
+        """Where the reference says the train was; writes into `shown`. `beyond`: past its ends, as its clock may be."""
         alternatives: list[Alternative] = []
         for stretch in self.stretches:
             first_ns = stretch.t_ns[0]
@@ -231,10 +241,10 @@ class TrainEvidence:
     def _carried(
         self, sources: Sequence[Carried], instants: _Instants, wanted: Bools, shown: _Shown
     ) -> list[Alternative]:
-        """By each odometer, from the anchors of its gaps: the train was where one of them says.
+        """Where each odometer says the train was, from the anchors of its gaps: where one of them says.
 
-        Writes into `shown`. Between two anchors of one surveyed way that the odometer closes the train was on that way;
-        a read itself needs no odometer.
+        Writes into `shown`. Between two anchors of one surveyed route that the odometer closes the train was on that
+        route; a read itself needs no odometer.
         """
         t_ns = instants.t_ns
         alternatives: list[Alternative] = []
@@ -243,24 +253,25 @@ class TrainEvidence:
             for gap in source.gaps:
                 rows = instants.within(gap.begin_ns, gap.end_ns)
                 rows = rows[open_rows[rows]]
+                # A gap with one anchor is open at one side: nothing is carried beyond a standstill.
                 if len(gap.anchors) == 1:
-                    rows = rows[~_after_standing(instants.t_ns[rows], gap, self.stood)]
-                for way in gap.ways or [] if rows.size else []:
-                    low_m, high_m = self._interval(source.counter, gap, way, t_ns[rows])
-                    there = Alternative(rows, way.chain.route(self.network), low_m, high_m).where(np.isfinite(low_m))
+                    rows = rows[~_after_standing(instants.t_ns[rows], gap, self.standstills)]
+                for route in gap.routes or [] if rows.size else []:
+                    low_m, high_m = self._interval(source.counter, gap, route, t_ns[rows])
+                    there = Alternative(rows, route.chain.route(self.network), low_m, high_m).where(np.isfinite(low_m))
                     alternatives.append(there)
                     open_rows[there.rows] = False
-                    by_read = any(anchor.kind is Kind.BALISE for anchor in gap.anchors)
-                    shown.kind[there.rows] = KINDS.index(Kind.BALISE if by_read else Kind.REFERENCE)
+                    shown.kind[there.rows] = max(KINDS.index(anchor.kind) for anchor in gap.anchors)
                     at_anchor = np.isin(t_ns[there.rows], [anchor.t_ns for anchor in gap.anchors if anchor.proved])
                     shown.proves[there.rows] = source.counter.odometer.independent | at_anchor
                     shown.on_survey[there.rows] = gap.on_survey(self.network) | at_anchor
         return alternatives
 
-    def _interval(self, counter: Counter, gap: Gap, way: GapChain, t_ns: Ints) -> Interval:
+    def _interval(self, counter: SignedOdometer, gap: Gap, route: GapChain, t_ns: Ints) -> Interval:
+        """Coordinates on a route through a gap, by both of its anchors or the only one."""
         if gap.begin is not None and gap.end is not None:
-            return between_anchors(counter, (gap.begin, gap.end), (way.at_m[0], way.at_m[1]), t_ns, self.config)
-        return carried(counter, gap.anchors[0], way.at_m[0], t_ns, self.config)
+            return between_anchors(counter, (gap.begin, gap.end), (route.at_m[0], route.at_m[1]), t_ns, self.config)
+        return carried(counter, gap.anchors[0], route.at_m[0], t_ns, self.config)
 
 
 def _on_path(stretch: KnownStretch, path: KnownPath, rows: Ints, t_ns: Ints, factor: float) -> list[Alternative]:
@@ -333,6 +344,7 @@ def _overlapping(
 
 
 def _spoken(alternatives: Sequence[Alternative], size: int) -> Bools:
+    """Instants at which there is an alternative."""
     spoken = np.zeros(size, dtype=np.bool_)
     for alternative in alternatives:
         spoken[alternative.rows] = True
@@ -359,9 +371,15 @@ def _narrowed(first: Alternative, second: Alternative) -> Alternative:
 
 
 def either(sets: Sequence[EvidenceSet]) -> EvidenceSet:
-    """One of several sets holds, nobody knows which: every alternative stays possible, and proved is what all prove.
+    """The union of several sets of which one holds, nobody knows which; proved is what all prove.
 
-    Where one is silent, so are all: it could have said anything.
+    Where one says nothing, so do all: it could have said anything.
+
+    Args:
+        sets: evidence at the same n instants, at least one.
+
+    Returns:
+        Evidence at these instants.
     """
     if len(sets) == 1:
         return sets[0]
@@ -384,10 +402,12 @@ class _Instants:
 
     @cached_property
     def _order(self) -> Ints:
+        """Rows in order of time."""
         return np.argsort(self.t_ns, kind="stable")
 
     @cached_property
     def _sorted_ns(self) -> Ints:
+        """Instants in order of time."""
         return self.t_ns[self._order]
 
     def within(self, first_ns: int, last_ns: int) -> Ints:
@@ -406,10 +426,10 @@ def within_spans(t_ns: Ints, spans: Sequence[Span]) -> Bools:
     return inside
 
 
-def _after_standing(t_ns: Ints, gap: Gap, stood: Sequence[Span]) -> Bools:
-    """Instants to which nothing can be carried, because the odometer stood on the way from the anchor."""
+def _after_standing(t_ns: Ints, gap: Gap, standstills: Sequence[Span]) -> Bools:
+    """Instants to which nothing can be carried, because the odometer stood still since the anchor."""
     void = np.zeros(t_ns.size, dtype=np.bool_)
-    for begin_ns, end_ns in stood:
+    for begin_ns, end_ns in standstills:
         if gap.begin is not None and end_ns > gap.begin_ns:
             void |= t_ns >= begin_ns
         if gap.end is not None and begin_ns < gap.end_ns:

@@ -8,7 +8,7 @@ from itertools import pairwise, product
 
 import numpy as np
 
-from pipeline.stages.evidence.carrying import Counter, TrueAnchor, beside_m, carried, closes
+from pipeline.stages.evidence.carrying import SignedOdometer, TrueAnchor, carried, closes, odometer_confidence_m
 from pipeline.stages.track.network import Edge, Network
 from pipeline.stages.track.path import Chain, Place, search
 from schemas.arrays import NS_PER_S, Ints
@@ -29,6 +29,7 @@ class GapChain:
 
     @property
     def apart_m(self) -> float:
+        """Distance between its anchors, as the odometer counts up [m]."""
         return self.at_m[-1] - self.at_m[0]
 
 
@@ -36,66 +37,68 @@ class GapChain:
 class Gap:
     """Time between two anchors, or on one side of one.
 
-    `ways` is None where there are more than can be weighed: then nothing is said of place or track.
+    `routes` is None where there are more than can be weighed: then nothing is said of place or track.
     """
 
     begin_ns: int
     end_ns: int
     begin: TrueAnchor | None
     end: TrueAnchor | None
-    ways: list[GapChain] | None
+    routes: list[GapChain] | None
 
     @property
     def anchors(self) -> list[TrueAnchor]:
+        """One or two."""
         return [anchor for anchor in (self.begin, self.end) if anchor is not None]
 
     @property
     def closed(self) -> list[GapChain]:
-        return [way for way in self.ways or [] if way.closed]
+        """The routes whose length the odometer counted."""
+        return [route for route in self.routes or [] if route.closed]
 
     @property
     def alone(self) -> list[GapChain]:
-        """The one closed way between two anchors; nothing where ways of several lengths close."""
-        lengths = {round(way.apart_m, 2) for way in self.closed}
+        """The one closed route between two anchors; nothing where routes of several lengths close."""
+        lengths = {round(route.apart_m, 2) for route in self.closed}
         return self.closed[:1] if len(lengths) == 1 and len(self.anchors) == 2 else []
 
     @property
     def only_length_m(self) -> list[float]:
-        """The length of the ways between two anchors, whether the odometer closes it or not; nothing if several."""
-        lengths = {round(way.apart_m, 2) for way in self.ways or []}
-        return [self.ways[0].apart_m] if self.ways and len(lengths) == 1 and len(self.anchors) == 2 else []
+        """The length of the routes between two anchors, whether the odometer closes it or not; nothing if several."""
+        lengths = {round(route.apart_m, 2) for route in self.routes or []}
+        return [self.routes[0].apart_m] if self.routes and len(lengths) == 1 and len(self.anchors) == 2 else []
 
     def on_survey(self, network: Network) -> bool:
-        """Both anchors are on surveyed track, and one way without a branch that the odometer closes joins them."""
-        if len(self.anchors) != 2 or len(self.closed) != 1 or len(self.ways or []) != 1:
+        """Both anchors are on surveyed track, and one route without a branch that the odometer closes joins them."""
+        if len(self.anchors) != 2 or len(self.closed) != 1 or len(self.routes or []) != 1:
             return False
         return all(anchor.proved for anchor in self.anchors) and not _branches_inside(self.closed[0].chain, network)
 
     @property
     def unreachable(self) -> bool:
         """No train can have passed its two anchors one after the other: one of the two is wrong."""
-        return len(self.anchors) == 2 and self.ways == []
+        return len(self.anchors) == 2 and self.routes == []
 
 
 @frozen
 class Carried:
     """What one odometer carries from anchors, by its gaps."""
 
-    counter: Counter
+    counter: SignedOdometer
     gaps: tuple[Gap, ...]
 
 
 @frozen
 class GapSearch:
-    """One odometer over the network, and which way the train ran as the odometer of the LDS counted up.
+    """One odometer over the network, and in which direction the train ran as the odometer of the LDS counted up.
 
-    `facing`: oriented net elements by the reference.
+    `oriented_elements`: oriented net elements by the reference.
     """
 
-    counter: Counter
+    counter: SignedOdometer
     network: Network
     config: Configuration
-    facing: frozenset[int] = frozenset()
+    oriented_elements: frozenset[int] = frozenset()
 
     def carried(self, borders: list[tuple[TrueAnchor, TrueAnchor]]) -> Carried:
         """Gaps before, between and after what is known, each border from one anchor to the other.
@@ -126,7 +129,7 @@ class GapSearch:
     def _between(self, begin: TrueAnchor, end: TrueAnchor) -> list[Gap]:
         """The gap between two anchors; where the odometer lost distance in it, two halves, each with one anchor.
 
-        Ways within the odometer's error come first; only where there is none, those within slip too.
+        Routes within the odometer's error come first; only where there is none, those within slip too.
         """
         if end.t_ns < begin.t_ns:
             return []
@@ -135,32 +138,33 @@ class GapSearch:
         length_m, bound_m = float(counted.distance_m[0]), float(counted.bound_m[0])
         if np.isnan(length_m):
             return [Gap(begin.t_ns, end.t_ns, begin, None, []), Gap(begin.t_ns, end.t_ns, None, end, [])]
-        way_m = self.counter.driven_m(begin.t_ns, end_ns)
+        driven_m = self.counter.driven_m(begin.t_ns, end_ns)
         hazards = self.config.hazards
         noise_m = hazards.evidence_factor * (begin.sigma_m + end.sigma_m) + begin.clock_m + end.clock_m
-        slack_m = float(beside_m(way_m, 0.0, self.config)[0]) + noise_m + bound_m
-        ways = self._ways_of_length(begin, end, length_m, slack_m)
-        if ways == []:
-            slip_m = hazards.slip_m + hazards.slip_share * float(way_m[0]) + bound_m
-            ways = self._ways_of_length(begin, end, length_m, slip_m)
-        if ways is not None:
+        slack_m = float(odometer_confidence_m(driven_m, 0.0, self.config)[0]) + noise_m + bound_m
+        routes = self._routes_of_length(begin, end, length_m, slack_m)
+        if routes == []:
+            slip_m = hazards.slip_m + hazards.slip_share * float(driven_m[0]) + bound_m
+            routes = self._routes_of_length(begin, end, length_m, slip_m)
+        if routes is not None:
             ends = (begin, end)
-            ways = [replace(way, closed=closes(self.counter, ends, way.apart_m, self.config)) for way in ways]
-        return [Gap(begin.t_ns, end.t_ns, begin, end, ways)]
+            routes = [replace(route, closed=closes(self.counter, ends, route.apart_m, self.config)) for route in routes]
+        return [Gap(begin.t_ns, end.t_ns, begin, end, routes)]
 
     def only_length_m(self, begin: TrueAnchor, end: TrueAnchor) -> list[float]:
-        """The length of the ways between two anchors, as the odometer counts up [m]; nothing if there are several."""
+        """The length of the routes between two anchors, as the odometer counts up [m]; nothing if there are several."""
         gaps = self._between(begin, end)
         return gaps[0].only_length_m if len(gaps) == 1 else []
 
     def misclosure_m(self, begin: TrueAnchor, end: TrueAnchor, scale: float, scale_sigma: float) -> float:
         """How much farther apart the anchors are than the odometer counted [m].
 
-        `scale`: true over counted distance beyond a vehicle file, with its sigma. 0 where a way closes within k_T
-        sigmas (at k = 3 a reference of few samples would step every few minutes), or none leads; NaN where ways differ.
+        `scale`: true over counted distance beyond a vehicle file, with its sigma. 0 where a route closes within k_T
+        sigmas (at k = 3 a reference of few samples would step every few minutes), or none leads; NaN where routes
+        differ.
         """
         gaps = self._between(begin, end)
-        if len(gaps) != 1 or not gaps[0].ways:
+        if len(gaps) != 1 or not gaps[0].routes:
             return 0.0
         counted = self.counter.between(begin.t_ns, np.array([end.t_ns]))
         counted_m = float(counted.distance_m[0])
@@ -169,45 +173,45 @@ class GapSearch:
         allowed_m += float(counted.bound_m[0]) + begin.clock_m + end.clock_m
         if not self.counter.by_file:
             allowed_m += self.config.lds.odometer_fixed_m
-        off_m = sorted((way.apart_m - scale * counted_m for way in gaps[0].ways), key=abs)
+        off_m = sorted((route.apart_m - scale * counted_m for route in gaps[0].routes), key=abs)
         if abs(off_m[0]) <= allowed_m:
             return 0.0
-        # At a stand a way leads there and one back: nobody knows which.
+        # At a stand a route leads there and one back: nobody knows which.
         other = any(abs(off) <= abs(off_m[0]) + allowed_m and abs(off - off_m[0]) > allowed_m for off in off_m)
         return float("nan") if other else off_m[0]
 
-    def _ways_of_length(
+    def _routes_of_length(
         self, first: TrueAnchor, second: TrueAnchor, length_m: float, slack_m: float
     ) -> list[GapChain] | None:
-        """Ways from anchor to anchor of the odometer's length +- the slack, either way round; None if too many.
+        """Routes from anchor to anchor of the odometer's length +- the slack, in either direction; None if too many.
 
         Each chain once: a gap of hardly any length is found from both sides.
         """
         network = self.network
         most = self.config.hazards.routes_limit
-        ways: dict[tuple[object, ...], GapChain] = {}
+        routes: dict[tuple[object, ...], GapChain] = {}
         for back in (False, True):
             starts, goals = (second, first) if back else (first, second)
-            way_m = -length_m if back else length_m
-            lengths_m = (max(way_m - slack_m, 0.0), way_m + slack_m)
+            signed_m = -length_m if back else length_m
+            lengths_m = (max(signed_m - slack_m, 0.0), signed_m + slack_m)
             for start, side, goal in product(starts.places, (0, 1), goals.places):
                 chains = chains_between(network, 2 * start.element + side, start, goal, lengths_m, back, most)
                 if chains is None:
                     return None
                 for chain in chains:
                     end_m = chain.entry_m[-1] + network.track.along_m(chain.oriented[-1], goal.measure_m)
-                    way = GapChain(chain, (end_m, 0.0) if back else (0.0, end_m))
-                    ways.setdefault((chain.oriented, round(way.apart_m, 2)), way)
-        return list(ways.values())
+                    route = GapChain(chain, (end_m, 0.0) if back else (0.0, end_m))
+                    routes.setdefault((chain.oriented, round(route.apart_m, 2)), route)
+        return list(routes.values())
 
     def _orientations(self, gaps: Sequence[Gap]) -> set[bool]:
-        """In which orientation of the network (`Network.usable`) the odometer counts up, over the whole run.
+        """Orientations of the network (`Network.usable`) in which the odometer counts up, over the whole run.
 
-        By closed gaps and by the reference (`facing`), never by the positions that are judged: so it is not asked of
-        `odometry.polarity`. Both where nothing decides: a loop turns trains round, parts of the network are not
-        connected, or the counter has no sign. Empty where the gaps contradict each other. (50 random topologies,
-        10,000 instants: the evidence leaves one element at 8,251 by a reference, 3,464 by reads; without `facing` at
-        7,679 and 3,464, with both orientations at 7,320 and 1,560.)
+        By closed gaps and by the reference (`oriented_elements`), never by the positions that are judged: so it is not
+        asked of `odometry.polarity`. Both where nothing decides: a loop turns trains round, parts of the network are
+        not connected, or the counter has no sign. Empty where the gaps contradict each other. (50 random topologies,
+        10,000 instants: the evidence leaves one element at 8,251 by a reference, 3,464 by reads; without
+        `oriented_elements` at 7,679 and 3,464, with both orientations at 7,320 and 1,560.)
         """
         both = {True, False}
         if not self.counter.signed:
@@ -217,8 +221,8 @@ class GapSearch:
         connected = set(self.network.connected[list(elements)].tolist())
         if not self.network.orientable or len(connected) > 1:
             return both
-        decided = [{bool(usable[way.chain.oriented[0]]) for way in gap.closed} for gap in gaps if gap.closed]
-        decided += [{bool(usable[oriented])} for oriented in self.facing]
+        decided = [{bool(usable[route.chain.oriented[0]]) for route in gap.closed} for gap in gaps if gap.closed]
+        decided += [{bool(usable[oriented])} for oriented in self.oriented_elements]
         return set.intersection(both, *decided)
 
     def _reaching(self, gap: Gap, orientations: set[bool]) -> Gap:
@@ -227,23 +231,23 @@ class GapSearch:
         Between two anchors too, where the train may have turned beyond one of them. (Without this the truth is outside
         at 269 of 7,508 instants by reads, in 3 of 50 random topologies; with it at none.)
         """
-        if gap.ways is None:
+        if gap.routes is None:
             return gap
         count = int((gap.end_ns - gap.begin_ns) / (self.counter.odometer.config.speed_window_s * NS_PER_S)) + 2
         # One speed window apart the train's farthest places are looked for.
         looks_ns = np.linspace(gap.begin_ns, gap.end_ns, count).astype(np.int64)
         turned = self._turned(gap, looks_ns)
         reached: list[GapChain] = []
-        for way in gap.ways if len(gap.anchors) == 2 else self._from_one_anchor(gap):
-            if self.network.usable[way.chain.oriented[0]] not in orientations:
+        for route in gap.routes if len(gap.anchors) == 2 else self._from_one_anchor(gap):
+            if self.network.usable[route.chain.oriented[0]] not in orientations:
                 continue
             most = self.config.hazards.routes_limit
-            chains = extended(self.network, way.chain, *self._reach_m(gap, way, looks_ns), most)
+            chains = extended(self.network, route.chain, *self._reach_m(gap, route, looks_ns), most)
             # A train that turned beyond a switch may have come back on another track.
             if chains is None or (turned and any(self._branches(chain) for chain in chains)):
-                return replace(gap, ways=None)
-            reached += [replace(way, chain=chain) for chain in chains]
-        return replace(gap, ways=reached)
+                return replace(gap, routes=None)
+            reached += [replace(route, chain=chain) for chain in chains]
+        return replace(gap, routes=reached)
 
     def _turned(self, gap: Gap, looks_ns: Ints) -> bool:
         """The train went back in the gap by more than the fixed error of the odometer."""
@@ -251,28 +255,29 @@ class GapSearch:
         distance_m = distance_m[np.isfinite(distance_m)]
         # The largest fall behind the farthest place so far; a run without a turn has none in one of the two senses.
         senses = (distance_m, -distance_m)
-        falls_m = [float((np.maximum.accumulate(way_m) - way_m).max(initial=0.0)) for way_m in senses]
+        falls_m = [float((np.maximum.accumulate(moved_m) - moved_m).max(initial=0.0)) for moved_m in senses]
         return min(falls_m) > self.config.lds.odometer_fixed_m
 
     def _branches(self, chain: Chain) -> bool:
+        """Whether the track branches on a chain, in either direction."""
         sides = (side for oriented in chain.oriented for side in (oriented, oriented ^ 1))
         return any(len(self.network.successors[side]) > 1 for side in sides)
 
     def _from_one_anchor(self, gap: Gap) -> list[GapChain]:
-        """The element of each place of the anchor, run either way round."""
+        """The element of each place of the anchor, run in either direction."""
         (anchor,) = gap.anchors
         along_m = self.network.track.along_m
         return [
-            # The coordinate is 0 at the anchor, so the element is entered at minus the way to it.
+            # The coordinate is 0 at the anchor, so the element is entered at minus the distance to it.
             GapChain(Chain((oriented,), (-along_m(oriented, place.measure_m),)), (0.0,))
             for place in anchor.places
             for oriented in (2 * place.element, 2 * place.element + 1)
         ]
 
-    def _reach_m(self, gap: Gap, way: GapChain, looks_ns: Ints) -> tuple[float, float]:
+    def _reach_m(self, gap: Gap, route: GapChain, looks_ns: Ints) -> tuple[float, float]:
         """Least and largest coordinate that the train may have come to in the gap [m]."""
-        reach_m = list(way.at_m)
-        for anchor, at_m in zip(gap.anchors, way.at_m, strict=True):
+        reach_m = list(route.at_m)
+        for anchor, at_m in zip(gap.anchors, route.at_m, strict=True):
             low_m, high_m = carried(self.counter, anchor, at_m, looks_ns, self.config)
             if np.isfinite(low_m).any():
                 reach_m += [float(np.nanmin(low_m)), float(np.nanmax(high_m))]
@@ -280,11 +285,12 @@ class GapSearch:
 
 
 def _without_contradicted(gaps: list[Gap]) -> list[Gap]:
-    """Nothing is carried outward from an anchor none of whose ways closes, nor from the anchors of an unreachable gap.
+    """Nothing is carried outward from an anchor none of whose routes closes, nor from the anchors of an unreachable
+    gap.
 
     One of these two is wrong, and nothing tells which.
     """
-    weighed = [gap for gap in gaps if len(gap.anchors) == 2 and gap.ways is not None]
+    weighed = [gap for gap in gaps if len(gap.anchors) == 2 and gap.routes is not None]
     joined = {id(anchor) for gap in weighed for anchor in gap.anchors}
     closed = {id(anchor) for gap in weighed if gap.closed for anchor in gap.anchors}
     wrong = {id(anchor) for gap in gaps if gap.unreachable for anchor in gap.anchors}
@@ -293,7 +299,7 @@ def _without_contradicted(gaps: list[Gap]) -> list[Gap]:
         anchors = {id(anchor) for anchor in gap.anchors}
         return bool(anchors & wrong) or (len(anchors) == 1 and bool(anchors & (joined - closed)))
 
-    return [replace(gap, ways=None) if doubtful(gap) and not gap.unreachable else gap for gap in gaps]
+    return [replace(gap, routes=None) if doubtful(gap) and not gap.unreachable else gap for gap in gaps]
 
 
 def _branches_inside(chain: Chain, network: Network) -> bool:

@@ -5,9 +5,11 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import replace
 from itertools import pairwise
+from typing import NamedTuple
 
 import numpy as np
 import polars as pl
+import pyarrow as pa
 
 from pipeline.stages.evidence.anchors import (
     KnownStretch,
@@ -15,15 +17,14 @@ from pipeline.stages.evidence.anchors import (
     final_stands,
     on_clock,
     outside,
-    read_anchors,
-    reference_ways,
+    reference_movements,
     shown_on_its_track,
     sided,
 )
 from pipeline.stages.evidence.carrying import (
-    Counter,
     Lags,
     RecorderClock,
+    SignedOdometer,
     TrueAnchor,
     clocks_of,
     lags_of,
@@ -49,6 +50,7 @@ from pipeline.stages.track.survey import SurveyedTrack
 from schemas.arrays import NS_PER_S, Floats, Ints, floats, times_ns
 from schemas.config import Configuration, HazardConfig, Vehicle
 from schemas.enums import Origin
+from schemas.frozen import frozen
 
 
 def on_time(stream: pl.DataFrame | None, latency_s: float) -> pl.DataFrame | None:
@@ -64,7 +66,8 @@ def without_frozen(
     """The reference without samples that repeat the one before while an odometer moves on: any, or any independent one.
 
     A recorder that stands still says nothing of where the train is (DOMAIN section 5.0): after so long the stretch
-    ends. A train that stands repeats too: there the odometer shows no way beyond its dead band and the sample's noise.
+    ends. A train that stands repeats too: there the odometer shows no movement beyond its dead band and the sample's
+    noise.
     """
     witnesses = [odometer for odometer in odometers if odometer.independent] or list(odometers)
     if reference is None or reference.height < 2 or not witnesses:
@@ -117,8 +120,8 @@ def known_stretch(
         reads_ns = _confirming_ns(known, stretch, clock_m, reads, config.hazards.evidence_factor, most_m)
         steps = contradictions(known, side.stretch, witnesses, config)
         of_path = Levels.of(steps, t_ns, reads_ns)
-        levels.append(of_path.seen(side.sense))
-        opened = left_open(known, t_ns, steps, of_path, beyond.seen(side.sense))
+        levels.append(of_path.oriented(side.sense))
+        opened = left_open(known, t_ns, steps, of_path, beyond.oriented(side.sense))
         paths.append(opened)
         possible_ns |= set(_confirming_ns(opened, stretch, clock_m, reads, config.align.sure_sigmas, np.inf))
     disputed = _disputed(t_ns, reads, possible_ns)
@@ -148,7 +151,7 @@ def known_stretch(
 
 
 def _disputed(t_ns: Ints, reads: Sequence[TrueAnchor], possible_ns: set[int]) -> list[tuple[int, int]]:
-    """For each read within the stretch at which the train was on none of its paths: the time between its neighbours.
+    """The time between the neighbours of each read at which the train was on none of the stretch's paths.
 
     Which of the two was right nobody knows, nor since when: without end where no read confirms the reference.
     """
@@ -182,9 +185,9 @@ def _confirming_ns(
             continue
         at_m = np.interp([float(read.t_ns - t_ns[0])], since_ns, known.at_m)
         sample = int(np.searchsorted(t_ns, read.t_ns))
-        beside = slice(max(sample - 1, 0), sample + 1)
-        low_m = float(at_m[0] + (known.low_m - known.at_m)[beside].min())
-        high_m = float(at_m[0] + (known.high_m - known.at_m)[beside].max())
+        around = slice(max(sample - 1, 0), sample + 1)
+        low_m = float(at_m[0] + (known.low_m - known.at_m)[around].min())
+        high_m = float(at_m[0] + (known.high_m - known.at_m)[around].max())
         route = known.path.legs[int(known.path.leg[sample])]
         half_m = factor * float(np.hypot(stretch.sigma_m[sample], read.sigma_m))
         half_m += float(clock_m[sample]) + read.clock_m
@@ -195,14 +198,13 @@ def _confirming_ns(
     return sorted(confirming)
 
 
-# Numerics: ways over which two odometers are compared [s].
+# Numerics: movements over which two odometers are compared [s].
 _PARTED_S = 60.0
 
 
 def evidence_of(
     reference: tuple[Sequence[ReferenceStretch], Sequence[Span]],
-    reads: pl.DataFrame | None,
-    balises: pl.DataFrame | None,
+    recorders: Sequence[Sequence[TrueAnchor]],
     odometers: Sequence[Odometry],
     network: Network,
     vehicle: Vehicle,
@@ -210,27 +212,43 @@ def evidence_of(
 ) -> TrainEvidence:
     """Everything that is known of where the train was, except from GNSS.
 
-    `reference`: as from `reference_stretches`; `odometers`: that of the LDS first. Where any is independent, the others
-    confirm nothing and narrow nothing; where none is, what they carry proves nothing.
+    Where any odometer is independent, the others confirm nothing and narrow nothing; where none is, what they carry
+    proves nothing.
+
+    Args:
+        reference: stretches of the reference and spans off the track [ns], as from `reference_stretches`.
+        recorders: anchors of each other recorder of places, by its own clock, in order of time.
+        odometers: all odometers, that of the LDS first.
+        network: the track network, its elements not in pieces.
+        vehicle: the place of the GNSS antenna [m].
+        config: the configuration; used are `hazards`, `evidence`, `align`, `lds` and `matching`.
+
+    Returns:
+        The evidence, which is asked for any instants.
+
+    Source:
+        DOMAIN sections 5.0 and 5.1.
     """
     hazards = config.hazards
     independent = [odometer for odometer in odometers if odometer.independent]
-    counters = [Counter(odometer, config.hazards.limits.doubt_m) for odometer in independent or odometers]
+    counters = [SignedOdometer(odometer, config.hazards.limits.doubt_m) for odometer in independent or odometers]
     main = counters[0] if counters else None
     least_m = config.matching.orientation_distance_m
-    stretches, silent = reference
+    stretches, off_track = reference
     sides = [sided(stretch, main, least_m) for stretch in stretches]
-    facing = frozenset(side.facing for side in sides if abs(side.with_m - side.against_m) >= least_m)
+    oriented = frozenset(side.first_oriented for side in sides if abs(side.with_m - side.against_m) >= least_m)
     if any(min(side.with_m, side.against_m) >= least_m for side in sides):
         counters = [counter.without_sign() for counter in counters]
-    searches = [GapSearch(counter, network, config, facing) for counter in counters]
+    searches = [GapSearch(counter, network, config, oriented) for counter in counters]
     lags = [_lags_of_reference(stretches, search, least_m) for search in searches]
     # Any odometer contradicts a reference; where one is independent, the others are not asked.
     found = [Witness.of(*of_one, config) for of_one in zip(counters, lags, strict=True)]
-    read = read_anchors(reads, balises, network.track, hazards)
-    lags_of_reads = [_lags_of_reads(search.carried(_points(read)), config) for search in searches]
-    of_reference, of_reads = clocks_of((lags, lags_of_reads), bool(independent), hazards)
-    clocked = on_clock(read, of_reads, main)
+    lags_of_others = [
+        [_lags_of_anchors(search.carried(_points(anchors)), config) for search in searches] for anchors in recorders
+    ]
+    of_reference, *of_others = clocks_of((lags, *lags_of_others), bool(independent), hazards)
+    by_recorder = [on_clock(anchors, clock, main) for anchors, clock in zip(recorders, of_others, strict=True)]
+    clocked = sorted((anchor for anchors in by_recorder for anchor in anchors), key=lambda anchor: anchor.t_ns)
     recorded, unclosed = _known_stretches(sides, of_reference, found, clocked, searches, vehicle, config)
     known = tuple(part for stretch in recorded for part in stretch.trusted())
     unsure = [span for stretch in recorded for span in stretch.doubtful_spans()]
@@ -238,23 +256,28 @@ def evidence_of(
     shift_ns = round(of_reference.shift_s * NS_PER_S)
     return TrainEvidence(
         stretches=known,
-        silent=tuple((begin_ns - shift_ns, end_ns - shift_ns) for begin_ns, end_ns in silent),
+        off_track=tuple((begin_ns - shift_ns, end_ns - shift_ns) for begin_ns, end_ns in off_track),
         carried=tuple(search.carried(_borders(known, search.counter, apart)) for search in searches),
         by_reads=tuple(search.carried(_points(clocked)) for search in searches) if recorded else (),
         reads_ns=np.array([anchor.t_ns for anchor in clocked], dtype=np.int64),
-        clocks=(of_reference,) * bool(known) + (of_reads,) * bool(apart),
+        clocks=(of_reference,) * bool(known) + _used(of_others, [outside(anchors, known) for anchors in by_recorder]),
         network=network,
         config=config,
         stands=final_stands([stretch.reference for stretch in known], independent, config),
         parted=_parted(odometers, config),
         unsure=tuple(unsure),
-        true_clocks_s=true_clocks_s((of_reference,) * bool(known) + (of_reads,) * bool(clocked)),
+        true_clocks_s=true_clocks_s((of_reference,) * bool(known) + _used(of_others, by_recorder)),
         disputes=tuple(span for stretch in recorded for span in stretch.disputed),
         doubted=unclosed
         + sum(stretch.levels.doubts for stretch in recorded)
         + (0 if counters else sum(len(stretch.disputed) for stretch in recorded))
         + sum(len(of_one.found) > 1 for of_one in lags),
     )
+
+
+def _used(clocks: Sequence[RecorderClock], anchors: Sequence[Sequence[TrueAnchor]]) -> tuple[RecorderClock, ...]:
+    """The clocks of the recorders that have anchors."""
+    return tuple(clock for clock, of_one in zip(clocks, anchors, strict=True) if of_one)
 
 
 def _known_stretches(
@@ -286,40 +309,42 @@ def _known_stretches(
 
 
 def _borders(
-    stretches: Sequence[KnownStretch], counter: Counter, reads: Sequence[TrueAnchor]
+    stretches: Sequence[KnownStretch], counter: SignedOdometer, reads: Sequence[TrueAnchor]
 ) -> list[tuple[TrueAnchor, TrueAnchor]]:
+    """First and last anchor of each stretch and of each read: between them nothing has to be carried."""
     return [*(stretch.ends(counter) for stretch in stretches), *_points(reads)]
 
 
 def _points(known: Sequence[TrueAnchor]) -> list[tuple[TrueAnchor, TrueAnchor]]:
+    """Anchors that last for an instant: first and last anchor are the same."""
     return [(anchor, anchor) for anchor in known]
 
 
 def _lags_of_reference(stretches: Sequence[ReferenceStretch], search: GapSearch, least_m: float) -> Lags:
     """Its clock against that of one odometer, in the sense in which that one counts.
 
-    One that counts up both ways is compared where the train cannot have turned.
+    One that counts up in both directions is compared where the train cannot have turned.
     """
     sides = [sided(stretch, search.counter, least_m) for stretch in stretches]
-    begin_ns, end_ns, way_m, sigma_m = reference_ways(sides, search.only_length_m)
-    way_m = way_m if search.counter.signed else np.abs(way_m)
-    return lags_of(begin_ns, end_ns, way_m, sigma_m, search.counter, search.config)
+    begin_ns, end_ns, moved_m, sigma_m = reference_movements(sides, search.only_length_m)
+    moved_m = moved_m if search.counter.signed else np.abs(moved_m)
+    return lags_of(begin_ns, end_ns, moved_m, sigma_m, search.counter, search.config)
 
 
-def _lags_of_reads(source: Carried, config: Configuration) -> Lags:
-    """The clock of the reads against an odometer's, by the ways between reads, whether they close or not."""
-    ways = [
+def _lags_of_anchors(source: Carried, config: Configuration) -> Lags:
+    """The clock of a recorder against an odometer's, by the distances between its anchors, closed or not."""
+    movements = [
         (gap.begin_ns, gap.end_ns, apart_m, float(np.linalg.norm([anchor.sigma_m for anchor in gap.anchors])))
         for gap in source.gaps
         for apart_m in gap.only_length_m
     ]
-    begins, ends, *lengths = zip(*ways, strict=True) if ways else ((), (), (), ())
-    way_m, sigma_m = (np.array(values, np.float64) for values in lengths)
-    return lags_of(np.array(begins, np.int64), np.array(ends, np.int64), way_m, sigma_m, source.counter, config)
+    begins, ends, *lengths = zip(*movements, strict=True) if movements else ((), (), (), ())
+    moved_m, sigma_m = (np.array(values, np.float64) for values in lengths)
+    return lags_of(np.array(begins, np.int64), np.array(ends, np.int64), moved_m, sigma_m, source.counter, config)
 
 
 def _parted(odometers: Sequence[Odometry], config: Configuration) -> bool:
-    """An odometer of unknown origin counts otherwise than an independent one, by more than 5 m + 5 % of a way."""
+    """An odometer of unknown origin counts otherwise than an independent one, by more than 5 m + 5 % of a distance."""
     independent = [odometer for odometer in odometers if odometer.independent]
     others = [odometer for odometer in odometers if odometer.origin is Origin.UNKNOWN and not odometer.follows_gnss]
     for other in others:
@@ -327,43 +352,85 @@ def _parted(odometers: Sequence[Odometry], config: Configuration) -> bool:
             begin_ns = max(other.begin_ns, witness.begin_ns)
             end_ns = min(other.end_ns, witness.end_ns)
             at_ns = np.arange(begin_ns, end_ns, round(_PARTED_S * NS_PER_S), dtype=np.int64)
-            ways = [np.abs(odometer.steps_m(at_ns)) for odometer in (other, witness)]
-            allowed_m = config.lds.odometer_fixed_m + config.lds.odometer_share * ways[1]
-            if (np.abs(ways[0] - ways[1]) > allowed_m).any():
+            moved_m = [np.abs(odometer.steps_m(at_ns)) for odometer in (other, witness)]
+            allowed_m = config.lds.odometer_fixed_m + config.lds.odometer_share * moved_m[1]
+            if (np.abs(moved_m[0] - moved_m[1]) > allowed_m).any():
                 return True
     return False
 
 
-def true_places(evidence: EvidenceSet, track: SurveyedTrack) -> pl.DataFrame:
-    """Per instant `true_netelement_ids`, in the order of the survey, `true_measure_low_m` and `true_measure_high_m`.
+@frozen
+class TruePlaces:
+    """Where the train was at each instant by the evidence; shape (instants,)."""
 
-    Null where nothing is known; the measures also where there are several net elements.
+    netelement_ids: pl.Series
+    """Every net element that the evidence leaves, in the order of the survey; null where nothing is known."""
+    low_m: Floats
+    """Least measure where one net element is left [m]."""
+    high_m: Floats
+    """Largest measure there [m]."""
+
+    def at(self, rows: Ints) -> TruePlaces:
+        """Those of some instants."""
+        return TruePlaces(self.netelement_ids[rows], self.low_m[rows], self.high_m[rows])
+
+    def columns(self) -> list[pl.Series]:
+        """As they stand in `epochs`."""
+        return [
+            self.netelement_ids.alias("true_netelement_ids"),
+            pl.Series("true_measure_low_m", self.low_m, nan_to_null=True),
+            pl.Series("true_measure_high_m", self.high_m, nan_to_null=True),
+        ]
+
+
+def true_places(evidence: EvidenceSet, track: SurveyedTrack) -> TruePlaces:
+    """Every net element that one of the alternatives touches, with the measures on it.
+
+    Args:
+        evidence: where the train was, at n instants.
+        track: the survey, whose elements the evidence numbers.
+
+    Returns:
+        Net elements and measures [m] of n instants.
     """
     parts = [_touched(alternative) for alternative in evidence.alternatives]
-    touched = pl.concat([pl.DataFrame(schema=_TOUCHED), *parts])
-    elements = pl.col("element").unique().sort()
-    places = touched.group_by("row").agg(elements, low=pl.col("low").min(), high=pl.col("high").max())
-    alone = pl.col("element").list.len() == 1
-    names = pl.Series(track.ids, dtype=pl.String)
-    numbers = pl.Series(range(names.len()), dtype=pl.Int64)
-    rows = pl.DataFrame({"row": np.arange(evidence.kind.size)})
-    return rows.join(places, on="row", how="left", maintain_order="left").select(
-        true_netelement_ids=pl.col("element").list.eval(pl.element().replace_strict(numbers, names)),
-        true_measure_low_m=pl.when(alone).then("low"),
-        true_measure_high_m=pl.when(alone).then("high"),
-    )
+    row, element = (np.concatenate([np.zeros(0, np.int64), *(getattr(part, name) for part in parts)]) for name in _KEYS)
+    ends_m = [np.concatenate([np.zeros(0), *(getattr(part, name) for part in parts)]) for name in ("low_m", "high_m")]
+    order = np.lexsort((element, row))
+    row, element, low_m, high_m = (values[order] for values in (row, element, *ends_m))
+    size = evidence.kind.size
+    begins = np.flatnonzero(np.diff(row, prepend=-1))
+    # Each net element once an instant, however often the train's routes lead over it.
+    once = np.diff(row * len(track.ids) + element, prepend=-1) != 0
+    counts = np.bincount(row[once], minlength=size)
+    places_m = np.full((2, size), np.nan)
+    if begins.size:
+        places_m[:, row[begins]] = np.minimum.reduceat(low_m, begins), np.maximum.reduceat(high_m, begins)
+    names = pl.Series(track.ids, dtype=pl.String)[element[once]]
+    offsets = np.concatenate([[0], np.cumsum(counts)]).astype(np.int32)
+    lists = pa.ListArray.from_arrays(pa.array(offsets), names.to_arrow(), mask=pa.array(counts == 0))
+    return TruePlaces(pl.Series(lists, dtype=pl.List(pl.String)), *np.where(counts == 1, places_m, np.nan))
 
 
-_TOUCHED = {"row": pl.Int64, "element": pl.Int64, "low": pl.Float64, "high": pl.Float64}
+_KEYS = ("row", "element")
 
 
-def _touched(there: Alternative) -> pl.DataFrame:
-    """Every net element that the interval touches, with the measures on it: one row per instant and visit."""
+class _Touched(NamedTuple):
+    """Net elements that an interval touches: one each instant and visit."""
+
+    row: Ints
+    element: Ints
+    low_m: Floats
+    high_m: Floats
+
+
+def _touched(there: Alternative) -> _Touched:
     route = there.route
     first, last = (
         np.maximum(np.searchsorted(route.entry_m, at_m, side="right") - 1, 0) for at_m in (there.low_m, there.high_m)
     )
     count = last - first + 1
+    # Each instant `count` times, and with it the visits from its first on.
     numbers = np.repeat(np.arange(there.rows.size), count)
     visit = np.repeat(first - np.concatenate([[0], np.cumsum(count)[:-1]]), count) + np.arange(count.sum())
     low = route.low_m[visit]
@@ -372,10 +439,9 @@ def _touched(there: Alternative) -> pl.DataFrame:
         np.clip(at_m[numbers] - route.entry_m[visit], 0.0, high - low) for at_m in (there.low_m, there.high_m)
     )
     forward = route.forward[visit]
-    columns = {
-        "row": there.rows[numbers],
-        "element": route.element[visit],
-        "low": np.where(forward, low + begin, high - end),
-        "high": np.where(forward, low + end, high - begin),
-    }
-    return pl.DataFrame(columns, schema=_TOUCHED)
+    return _Touched(
+        row=there.rows[numbers],
+        element=route.element[visit],
+        low_m=np.where(forward, low + begin, high - end),
+        high_m=np.where(forward, low + end, high - begin),
+    )

@@ -45,7 +45,7 @@ class Steps:
 
 
 def common_steps(odometer: pl.DataFrame, fixes: pl.DataFrame, config: Configuration) -> Steps | None:
-    """None where the two have hardly a time in common."""
+    """Steps of both recorders over the same times, along the direction of travel; None without times in common."""
     if not odometer.height or not fixes.height:
         return None
     epoch_ns = int(times_ns(fixes)[0])
@@ -69,18 +69,18 @@ def common_steps(odometer: pl.DataFrame, fixes: pl.DataFrame, config: Configurat
         unbroken &= _without_pause(t_s, recorded_s, _PAUSE_PERIODS * own_s)
     reach = max(1, round(_AROUND_S / period_s))
     chord_m = np.column_stack([around_sum(axis, reach) for axis in moved_m[:, :2].T])
-    way_m = around_sum(odometer_m, reach)
+    driven_m = around_sum(odometer_m, reach)
     length_m = np.hypot(*chord_m.T)
     least_m = _MOVING_MPS * around_sum(dt_s, reach)
     ahead = chord_m / np.maximum(length_m, 1e-9)[:, None]
     return Steps(
         t_s=t_s[:-1],
         period_s=period_s,
-        odometer_m=odometer_m * np.where(way_m < 0.0, -1.0, 1.0),
+        odometer_m=odometer_m * np.where(driven_m < 0.0, -1.0, 1.0),
         along_m=moved_m[:, 0] * ahead[:, 0] + moved_m[:, 1] * ahead[:, 1],
         across_m=moved_m[:, 1] * ahead[:, 0] - moved_m[:, 0] * ahead[:, 1],
         up_m=moved_m[:, 2],
-        moving=(length_m > least_m) & (np.abs(way_m) > least_m),
+        moving=(length_m > least_m) & (np.abs(driven_m) > least_m),
         unbroken=unbroken,
     )
 
@@ -114,15 +114,17 @@ def _placed(fixes: pl.DataFrame, epoch_ns: int) -> tuple[Floats, tuple[Floats, F
 
 
 def _since_s(frame: pl.DataFrame, epoch_ns: int) -> Floats:
+    """Times of a stream since an instant [s]."""
     return np.asarray((times_ns(frame) - epoch_ns) * 1e-9, dtype=np.float64)
 
 
 def _without_pause(t_s: Floats, recorded_s: Floats, longest_s: float) -> Bools:
-    """Per step of `t_s`: this recorder has a row at least each `longest_s` around its begin and end."""
+    """Whether the recorder has a row at least each `longest_s` around begin and end of each step of `t_s`."""
     pauses = np.flatnonzero(np.diff(recorded_s) > longest_s)
     broken = np.zeros(t_s.size + 1, dtype=np.int64)
     first = np.searchsorted(t_s, recorded_s[pauses], side="right") - 1
     last = np.searchsorted(t_s, recorded_s[pauses + 1], side="left")
+    # +1 where a pause begins and -1 where it ends: the running sum counts the pauses over each step.
     np.add.at(broken, np.clip(first, 0, t_s.size), 1)
     np.add.at(broken, np.clip(last, 0, t_s.size), -1)
     free: Bools = np.cumsum(broken)[: t_s.size - 1] == 0
@@ -138,6 +140,7 @@ def around_sum(steps: Floats, reach: int) -> Floats:
 
 
 def _sums(steps: Floats) -> Floats:
+    """Running sum of steps from 0 on, shape (n,) to (n + 1,)."""
     return np.concatenate([[0.0], np.cumsum(steps)])
 
 
@@ -158,7 +161,7 @@ def correlated_at_stands(steps: Steps, config: EvidenceConfig) -> bool:
     time_s = odometer_m.size * _STEP_S
     if time_s < config.follows_stand_s:
         return False
-    return any(_tells(odometer_m, other_m, time_s, config) for other_m in (along_m, length_m))
+    return any(_correlates(odometer_m, other_m, time_s, config) for other_m in (along_m, length_m))
 
 
 def _standing(steps: Steps, config: EvidenceConfig) -> Bools:
@@ -183,7 +186,7 @@ def _seconds(steps: Steps, first: int, last: int) -> Floats:
     return np.stack([odometer_m, along_m, np.hypot(along_m, across_m)])
 
 
-def _tells(odometer_m: Floats, other_m: Floats, time_s: float, config: EvidenceConfig) -> bool:
+def _correlates(odometer_m: Floats, other_m: Floats, time_s: float, config: EvidenceConfig) -> bool:
     """Steps beyond four usual ones count as four: a train that creeps moves both, and its wheel is no copy."""
     first, second = (_usual(steps_m) for steps_m in (odometer_m, other_m))
     if not (first.any() and second.any()):
@@ -221,6 +224,7 @@ class Follows:
     at_stands: bool = False
 
     def found(self, config: EvidenceConfig) -> bool:
+        """Whether the odometer is made of the positions."""
         return self.at_stands or (self.ratio is not None and self.ratio < config.follows_limit)
 
 
@@ -228,9 +232,20 @@ NOT_TESTED = Follows()
 
 
 def follows_positions(odometer: pl.DataFrame, fixes: pl.DataFrame, config: Configuration) -> Follows:
-    """Whether an odometer (one sensor) is made of these positions (one solution), both cleaned, with their times.
+    """Whether an odometer is made of these positions.
 
     At most `follows_steps_most` steps spread over the run are looked at, so that an hour at 10 Hz takes milliseconds.
+
+    Args:
+        odometer: the stream of one sensor, cleaned.
+        fixes: the stream `gnss` of one solution, cleaned.
+        config: the configuration; used are `evidence.follows_*` and `align.fastest_mps`.
+
+    Returns:
+        The ratio V and what was found at stands; `NOT_TESTED` where the two have hardly a time in common.
+
+    Source:
+        DOMAIN section 5.0.
     """
     steps = common_steps(odometer, fixes, config)
     if steps is None:
@@ -268,6 +283,7 @@ def _in_motion(steps: Steps) -> Ints:
 
 
 def _spread(rows: Ints, most: int) -> Ints:
+    """At most so many of the rows, evenly spread."""
     return rows if rows.size <= most else rows[np.linspace(0, rows.size - 1, most).astype(np.int64)]
 
 
@@ -277,6 +293,7 @@ def _around(steps_m: Floats, rows: Ints, reach: int) -> Floats:
 
 
 def _neighbours(steps_m: Floats, rows: Ints, reach: int) -> Floats:
+    """The same without the row itself, shape (rows, 2 reach)."""
     return np.delete(_around(steps_m, rows, reach), reach, axis=1)
 
 
@@ -292,4 +309,5 @@ def _unexplained(wanted_m: Floats, by_m: Floats) -> Floats:
 
 
 def _sigma_m(residuals_m: Floats, part: float, of_normal: float) -> float:
+    """Sigma [m] of a normal variable whose absolute value has this quantile; `of_normal`: that of sigma 1."""
     return float(np.quantile(residuals_m, part)) / of_normal

@@ -13,7 +13,8 @@ tables. Touches no file. Velocity, and scale and latency learned in the run, dec
 |---|---|
 | in which order is it judged; when did the train itself pass each balise, and what became of each passage | `judge` |
 | what is judged, and by what; was a position right | `judgement` |
-| per epoch and offer: which way did the train move, was the position in use, how far off across | `epochs` |
+| in which arrays does what is judged go on | `judged` |
+| per epoch and offer: in which direction did the train move, was the position in use, how far off across | `epochs` |
 | where did the position jump; which wrong time in use is one failure | `failures` |
 | since and until when was a position wrong, when was it detected; was an alarm due, who is suspected | `episodes` |
 | which hazards | `hazards` |

@@ -11,12 +11,14 @@ import polars as pl
 from pipeline.stages.epochs.verdicts import AlarmEpisode, FailureLog
 from pipeline.stages.evidence.evidence import NOTHING
 from pipeline.stages.judge.failures import ErrorHistory, Failure, Jump, failure_at
-from pipeline.stages.judge.judgement import ODOMETER, WRONG, Judgements, margins_m
-from schemas.arrays import NS_PER_S, Bools, Floats, floats, spans_of, times_ns
+from pipeline.stages.judge.judged import ODOMETER, WRONG, JudgedEpochs
+from pipeline.stages.judge.judgement import margins_m
+from schemas.arrays import NS_PER_S, Bools, Floats, spans_of
 from schemas.config import Configuration, HazardConfig
 from schemas.conform import dtypes, table_of_rows
 from schemas.enums import Suspect, Verdict
 from schemas.frozen import frozen
+from schemas.stages import MatchedEpochs
 from schemas.tables import ALL_MONITORS, Alarms
 
 _ODOMETER = "odometer"
@@ -69,7 +71,20 @@ class Episode(Extent):
 def find_episodes(
     history: ErrorHistory, failures: Sequence[Failure], log: FailureLog, faults: pl.DataFrame | None
 ) -> list[Episode]:
-    """One episode for each time that positions left the evidence, or offered a VB wrong."""
+    """One episode for each time that positions left the evidence, or offered a VB wrong.
+
+    Args:
+        history: the positions, judged, with their jumps and offers.
+        failures: of the same positions.
+        log: which monitor failed when.
+        faults: those injected (`t_start`, `t_end`, `target`), which name an onset better than positions can; or None.
+
+    Returns:
+        Episodes in order of time; none overlap.
+
+    Source:
+        DOMAIN section 5.3.
+    """
     episodes: list[Episode] = []
     floor = 0
     for mark in np.flatnonzero(history.judged.is_wrong | _offered_wrong(history)).tolist():
@@ -83,7 +98,7 @@ def find_episodes(
 def _offered_wrong(history: ErrorHistory) -> Bools:
     """Positions that complete an offer judged wrong; balises that a jump passes on its way belong to the jump."""
     marked = np.zeros(history.size, dtype=np.bool_)
-    marked[history.offers.number[history.offers.offered & history.offers.judged.is_wrong]] = True
+    marked[history.completing[history.offers.offered & history.offers.judged.is_wrong]] = True
     for jump in history.jumps:
         marked[jump.first : jump.last + 1] = False
     return marked
@@ -197,14 +212,28 @@ def _failed_may_ns(history: ErrorHistory, failed: int) -> int | None:
     return int(history.t_ns[since][may[since]][0])
 
 
-Healthy = dict[str | None, Bools]
+Healthy = dict[str, Bools]
 """Epochs whose error is within the noise, by axis of the monitors."""
 
 
 def alarms_table(
-    name: str, epochs: pl.DataFrame, log: FailureLog, hazards: Sequence[Episode], config: Configuration
+    name: str, epochs: JudgedEpochs, log: FailureLog, hazards: Sequence[Episode], config: Configuration
 ) -> pl.DataFrame:
-    """One row per alarm episode; `name`: of the solution, `epochs`: judged, `hazards`: the episode of each row."""
+    """One row per alarm episode, with its verdict and who is suspected.
+
+    Args:
+        name: of the solution.
+        epochs: its epochs as judged.
+        log: its alarms.
+        hazards: the episode of each row of hazards.
+        config: margins, look-back and Doppler gap.
+
+    Returns:
+        Rows of `schemas.tables.Alarms`.
+
+    Source:
+        DOMAIN section 5.3; CONTRACT section 3.
+    """
     healthy = healthy_across(epochs, config.hazards)
     rows = [
         {
@@ -217,42 +246,53 @@ def alarms_table(
             "verdict": verdict_of(alarm, epochs, healthy, config.hazards).value,
             "suspect": suspect_of(epochs, alarm.start_ns, alarm.end_ns, config).value,
             "hazard_id": next((number for number, episode in enumerate(hazards) if _belongs(alarm, episode)), None),
-            "netelement_id": epochs["netelement_id"][alarm.first],
-            "measure_m": epochs["measure_m"][alarm.first],
+            **_place_of(epochs, alarm.first),
         }
         for number, alarm in enumerate(log.alarms)
     ]
     return table_of_rows(rows, dtypes(Alarms))
 
 
-def healthy_across(epochs: pl.DataFrame, config: HazardConfig) -> Healthy:
-    """Per axis across the track, epochs whose error by the reference is within the noise of both."""
-    reference_m = np.nan_to_num(Judgements.of(epochs).half_m / config.evidence_factor)
-    noise_m = {
-        axis: config.evidence_factor * np.hypot(np.nan_to_num(floats(epochs, f"sigma_{axis}_m")), reference_m)
-        for axis in ("cross", "up")
+def _place_of(epochs: MatchedEpochs, epoch: int) -> dict[str, object]:
+    """Where the train was matched at an epoch."""
+    element, measure_m = int(epochs.element[epoch]), float(epochs.measure_m[epoch])
+    return {
+        "netelement_id": epochs.elements[element] if element >= 0 else None,
+        "measure_m": None if np.isnan(measure_m) else measure_m,
     }
-    return {axis: np.abs(floats(epochs, f"error_{axis}_m")) <= limit_m for axis, limit_m in noise_m.items()}
 
 
-def verdict_of(alarm: AlarmEpisode, epochs: pl.DataFrame, healthy: Healthy, config: HazardConfig) -> Verdict:
+def healthy_across(epochs: JudgedEpochs, config: HazardConfig) -> Healthy:
+    """Per axis across the track, epochs whose error by the reference is within the noise of both."""
+    reference_m = np.nan_to_num(epochs.judgements.half_m / config.evidence_factor)
+    axes = {
+        "cross": (epochs.error_cross_m, epochs.sigma_cross_m),
+        "up": (epochs.error_up_m, epochs.sigma_up_m),
+    }
+    return {
+        axis: np.abs(error_m) <= config.evidence_factor * np.hypot(np.nan_to_num(sigma_m), reference_m)
+        for axis, (error_m, sigma_m) in axes.items()
+    }
+
+
+def verdict_of(alarm: AlarmEpisode, epochs: JudgedEpochs, healthy: Healthy, config: HazardConfig) -> Verdict:
     """True where the whole interval was beyond the margin at some epoch, false where all of it stayed within.
 
     Only reference or balise reads can say false, and only of every position from 300 s before the alarm to its end; of
     an alarm across the track only a reference, for four metres aside are another track.
     """
     since_ns = alarm.start_ns - round(config.false_alarm_lookback_s * NS_PER_S)
-    first = int(np.searchsorted(times_ns(epochs), since_ns))
-    part = epochs[first : alarm.last + 1]
-    can_say_false = Judgements.of(part).by_truth
-    for axis in {monitor.axis for monitor in ALL_MONITORS if monitor.name in alarm.monitors} & healthy.keys():
-        can_say_false = can_say_false & healthy[axis][first : alarm.last + 1]
-    positioned = part["path_m"].is_not_null().to_numpy()
-    judged = Judgements.of(part.filter(positioned))
+    first = int(np.searchsorted(epochs.t_ns, since_ns))
+    part = first + np.flatnonzero(epochs.positioned[first : alarm.last + 1])
+    judged = epochs.judgements.at(part)
+    can_say_false = judged.by_truth
+    axes = {monitor.axis for monitor in ALL_MONITORS if monitor.name in alarm.monitors}
+    for axis in healthy.keys() & axes:
+        can_say_false = can_say_false & healthy[axis][part]
     if judged.wrong_track.any():
         return Verdict.TRUE
-    margin_m = margins_m(floats(part, "sigma_along_m"), config)[positioned]
-    return verdict_within(judged.low_m, judged.high_m, margin_m, can_say_false[positioned])
+    margin_m = margins_m(epochs.sigma_along_m[part], config)
+    return verdict_within(judged.low_m, judged.high_m, margin_m, can_say_false)
 
 
 def verdict_within(low_m: Floats, high_m: Floats, margin_m: Floats, can_say_false: Bools) -> Verdict:
@@ -271,7 +311,7 @@ def _belongs(alarm: AlarmEpisode, episode: Episode) -> bool:
     return lasted or (detected_ns is not None and alarm.start_ns <= detected_ns <= alarm.end_ns)
 
 
-def suspect_of(epochs: pl.DataFrame, begin_ns: int, end_ns: int, config: Configuration) -> Suspect:
+def suspect_of(epochs: JudgedEpochs, begin_ns: int, end_ns: int, config: Configuration) -> Suspect:
     """An opinion, on which only its column depends; from `suspect_lookback_s` before an alarm or hazard to its end.
 
     The first row that applies; the map is found over several runs (`pipeline/results/figures/map_errors.py`).
@@ -284,30 +324,30 @@ def suspect_of(epochs: pl.DataFrame, begin_ns: int, end_ns: int, config: Configu
     | 4 | the match was ambiguous | track |
     | 5 | else | unknown |
     """
-    t_ns = times_ns(epochs)
-    first = int(np.searchsorted(t_ns, begin_ns - round(config.hazards.suspect_lookback_s * NS_PER_S)))
-    part = epochs[first : max(first, int(np.searchsorted(t_ns, end_ns, side="right")))]
-    judged = Judgements.of(part)
-    margin_m = margins_m(floats(part, "sigma_along_m"), config.hazards)
+    first = int(np.searchsorted(epochs.t_ns, begin_ns - round(config.hazards.suspect_lookback_s * NS_PER_S)))
+    part = slice(first, max(first, int(np.searchsorted(epochs.t_ns, end_ns, side="right"))))
+    judged = epochs.judgements.at(part)
+    margin_m = margins_m(epochs.sigma_along_m[part], config.hazards)
     left = (judged.least_m > margin_m) | judged.wrong_track
     if (left & (judged.kind != ODOMETER)).any():
         return Suspect.GNSS
-    if (part["stood"] | part["odometer_wrong"]).any() or _parted_together(part, margin_m, config):
+    contradicted = epochs.odometer_stood[part] | epochs.odometer_wrong[part]
+    if contradicted.any() or _parted_together(epochs, part, margin_m, config):
         return Suspect.ODOMETER
     if left.any():
         return Suspect.GNSS
-    ambiguous = part["path_m"].is_not_null() & ~part["unambiguous"]
+    ambiguous = epochs.positioned[part] & ~epochs.unambiguous[part]
     return Suspect.TRACK if ambiguous.any() else Suspect.UNKNOWN
 
 
-def _parted_together(part: pl.DataFrame, margin_m: Floats, config: Configuration) -> bool:
+def _parted_together(epochs: JudgedEpochs, part: slice, margin_m: Floats, config: Configuration) -> bool:
     """Position and Doppler agree with each other where both left the odometer, by half the margin of the position."""
-    columns = part.select("path_m", "odometer_m", "velocity_along_mps").cast(pl.Float64).to_numpy()
-    known = np.isfinite(columns).all(axis=1)
+    columns = np.array([epochs.path_m[part], epochs.odometer_m[part], epochs.velocity_along_mps[part]])
+    known = np.isfinite(columns).all(axis=0)
     if known.sum() < 2:
         return False
-    path_m, odometer_m, velocity_mps = columns[known].T
-    dt_s = np.diff(times_ns(part)[known]) / NS_PER_S
+    path_m, odometer_m, velocity_mps = columns[:, known]
+    dt_s = np.diff(epochs.t_ns[part][known]) / NS_PER_S
     mean_mps = 0.5 * (velocity_mps[1:] + velocity_mps[:-1])
     near = dt_s <= config.monitors.doppler_gap_s
     doppler_m = np.concatenate([[0.0], np.cumsum(np.where(near, mean_mps * dt_s, 0.0))])

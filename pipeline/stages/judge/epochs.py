@@ -5,32 +5,19 @@ from __future__ import annotations
 import numpy as np
 import polars as pl
 
-from pipeline.stages.epochs.clock import (
-    crossing_gaps_ns,
-    holds,
-    nominal_period_s,
-    periods_before_s,
-    reactions_ns,
-    trusted,
-    unambiguous,
-)
-from pipeline.stages.evidence import true_places
+from pipeline.stages.epochs.clock import crossing_gaps_ns, nominal_period_s, periods_before_s, reactions_ns
+from pipeline.stages.epochs.monitored import MonitoredEpochs
+from pipeline.stages.evidence import TrainEvidence, true_places
 from pipeline.stages.evidence.evidence import Span, within_spans
-from pipeline.stages.judge.judgement import (
-    REFERENCE,
-    RIGHT,
-    WRONG,
-    JudgeInput,
-    Judgements,
-    MatchedPositions,
-    judge_positions,
-    judgements_of,
-)
+from pipeline.stages.judge.judged import REFERENCE, RIGHT, WRONG, JudgedEpochs, JudgedOffers, Judgements
+from pipeline.stages.judge.judgement import JudgeInput, MatchedPositions, judge_positions, judgements_of, valid_at_ns
 from pipeline.stages.track.geodesy import points_of
-from schemas.arrays import NS_PER_S, Bools, Floats, Ints, flags, floats, ints, runs_of, spans_of, times_ns
-from schemas.config import Configuration, HazardConfig, LdsConfig
+from pipeline.stages.track.path import TravelledPath
+from schemas.arrays import NS_PER_S, Bools, Floats, Ints, floats, ints, runs_of, spans_of, times_ns
+from schemas.config import Configuration, HazardConfig, LdsConfig, Vehicle
 from schemas.enums import LdsState
 from schemas.frozen import frozen
+from schemas.stages import AlignedEpochs
 
 # An axis of the position, the position itself, a constellation or a satellite; any other target is no fault of GNSS.
 _GNSS = r"(?i)^(along|cross|up|east|north|position|velocity|gnss|satellites?|gps|galileo|glonass|beidou|[A-Z][0-9]{2})$"
@@ -48,10 +35,10 @@ def under_injection(t_ns: Ints, faults: pl.DataFrame | None, recovery_s: float) 
     return under
 
 
-def cross_errors(given: JudgeInput, heading_deg: Floats) -> list[pl.Series]:
-    """`error_cross_m`, `error_up_m`: position minus reference, left of growing path and upwards.
+def cross_errors(given: JudgeInput, heading_deg: Floats) -> Floats:
+    """Position minus reference, left of growing path and upwards [m]; shape (2, epochs).
 
-    Null where the reference is silent, and where the position is farther ahead or behind than the failure limit: over
+    NaN where the reference is silent, and where the position is farther ahead or behind than the failure limit: over
     such a distance a curve alone is metres aside, and a slope metres up.
     """
     at_ns = given.instants_of_epochs()
@@ -78,20 +65,19 @@ def cross_errors(given: JudgeInput, heading_deg: Floats) -> list[pl.Series]:
         left_m = north * np.sin(heading) - east * np.cos(heading)
         near = np.abs(along_m) <= given.config.hazards.limits.abreast_m
         errors_m[:, rows] = np.where(near, [left_m, height_m[rows] - there[2]], np.nan)
-    names = ("error_cross_m", "error_up_m")
-    return [pl.Series(name, error_m, nan_to_null=True) for name, error_m in zip(names, errors_m, strict=True)]
+    return errors_m
 
 
 @frozen
 class OdometerSteps:
     """From each epoch to the next: `counts`, the odometer has no gap there; `moves`, it shows movement.
 
-    `stood`: times [ns] in which it shows none while positions leave their place by more than the failure limit.
+    `standstills`: times [ns] in which it shows none while positions leave their place by more than the failure limit.
     """
 
     moves: Bools
     counts: Bools
-    stood: tuple[Span, ...] = ()
+    standstills: tuple[Span, ...] = ()
 
 
 def odometer_steps(given: JudgeInput) -> OdometerSteps:
@@ -103,14 +89,14 @@ def odometer_steps(given: JudgeInput) -> OdometerSteps:
         return OdometerSteps(*np.zeros((2, at_ns.size), dtype=np.bool_))
     moves = _to_the_next(odometry.moved(at_ns), at_ns.size)
     counts = _to_the_next(np.isfinite(odometry.steps_m(at_ns)), at_ns.size)
-    path_m = floats(given.solution.epochs, "path_m")
-    stood: list[Span] = []
+    path_m = given.solution.epochs.path_m
+    standstills: list[Span] = []
     for first, last in spans_of(counts & ~moves):
         rows = slice(first, min(last + 2, at_ns.size))
         places_m = path_m[rows][np.isfinite(path_m[rows])]
         if np.abs(places_m - places_m[:1]).max(initial=0.0) > given.config.hazards.limits.stand_m:
-            stood.append((int(at_ns[rows][0]), int(at_ns[rows][-1])))
-    return OdometerSteps(moves, counts, tuple(stood))
+            standstills.append((int(at_ns[rows][0]), int(at_ns[rows][-1])))
+    return OdometerSteps(moves, counts, tuple(standstills))
 
 
 def travel_direction(
@@ -141,22 +127,24 @@ def travel_direction(
 
 
 def moving(
-    at_ns: Ints, reference_m: Floats, half_m: Floats, steps: OdometerSteps, stood: Bools, config: Configuration
-) -> pl.Series:
-    """Per epoch whether the train moves to the next one, null where neither reference nor odometer knows.
+    at_ns: Ints, reference_m: Floats, half_m: Floats, steps: OdometerSteps, standing: Bools, config: Configuration
+) -> tuple[Bools, Bools]:
+    """Per epoch whether the train moves to the next one, as is known, and whether it may.
 
-    By the reference (`reference_m` +- `half_m`) it does where its way over a second exceeds dead band and noise.
+    It may too where neither reference nor odometer knows.
+
+    By the reference (`reference_m` +- `half_m`) it does where its movement over a second exceeds dead band and noise.
     """
     moved_m, noise_m, elapsed_s = _moved_m(at_ns, reference_m, half_m, config.align.speed_window_s)
     by_reference = np.abs(moved_m) > config.matching.deadband_mps * elapsed_s + noise_m
     moves = by_reference | (steps.moves & steps.counts)
-    sure = np.isfinite(moved_m) | (steps.counts & ~stood)
-    frame = pl.DataFrame({"moving": _to_the_next(moves[:-1], at_ns.size), "sure": _to_the_next(sure[:-1], at_ns.size)})
-    return frame.select(pl.when("sure").then("moving")).to_series()
+    sure = np.isfinite(moved_m) | (steps.counts & ~standing)
+    moves, sure = (_to_the_next(steps_of[:-1], at_ns.size) for steps_of in (moves, sure))
+    return moves & sure, moves | ~sure
 
 
 def _moved_m(at_ns: Ints, place_m: Floats, half_m: Floats, window_s: float) -> tuple[Floats, Floats, Floats]:
-    """From each epoch to the one `window_s` later: the way [m], the half intervals of both places [m], the time [s]."""
+    """From each epoch to the one `window_s` later: the distance [m], both half intervals [m], the time [s]."""
     ahead = np.searchsorted(at_ns, at_ns + round(window_s * NS_PER_S)).clip(0, at_ns.size - 1)
     return place_m[ahead] - place_m, half_m + half_m[ahead], (at_ns[ahead] - at_ns) / NS_PER_S
 
@@ -193,37 +181,57 @@ def beyond_confidence(
     return beyond
 
 
-def speed_at(epochs: pl.DataFrame, t_ns: Ints) -> Floats:
+def speed_at(epochs: AlignedEpochs, at_ns: Ints) -> Floats:
     """Speed [m/s] as the epochs around each instant show it, the train's own; NaN where no epoch knows it."""
-    known = epochs.filter(pl.col("speed_mps").is_not_null())
-    if known.is_empty():
-        return np.full(t_ns.size, np.nan)
-    begin_ns = times_ns(epochs)[0]
-    at_s, stamps_s = ((values - begin_ns) / NS_PER_S for values in (t_ns, times_ns(known)))
-    return np.asarray(np.interp(at_s, stamps_s, np.abs(floats(known, "speed_mps"))))
+    known = np.isfinite(epochs.speed_mps)
+    if not known.any():
+        return np.full(at_ns.size, np.nan)
+    at_s, stamps_s = ((values - epochs.t_ns[0]) / NS_PER_S for values in (at_ns, epochs.t_ns[known]))
+    return np.asarray(np.interp(at_s, stamps_s, np.abs(epochs.speed_mps[known])))
 
 
 # Numerics: times shorter than half a nanosecond are rounding.
 _LEAST_S = 0.5 / NS_PER_S
 
 
-def time_in_use(epochs: pl.DataFrame, code: Ints, config: Configuration) -> pl.DataFrame:
-    """Per epoch `in_use`, and the time before it that it accounts for [s] (DOMAIN section 5.3).
+@frozen
+class TimeInUse:
+    """Which positions were in use, and for how long (DOMAIN section 5.3); arrays of shape (epochs,)."""
 
-    `used_s`: of a position in use all time since the position before, up to the longest step that is no gap; `wrong_s`:
-    of it where the position was wrong. `counted_s`: for shares of time, `wrong_s` where there is any. An epoch without
-    a position accounts for time only in a gap.
+    in_use: Bools
+    """Some of the time before the position was not negated, and it may be relied on."""
+    used_s: Floats
+    """Of a position in use all time since the position before, up to the longest step that is no gap [s]."""
+    wrong_s: Floats
+    """Of it where the position was wrong [s]."""
+    counted_s: Floats
+    """For shares of time, `wrong_s` where there is any [s]. An epoch without a position accounts only for a gap."""
+
+
+def time_in_use(epochs: MonitoredEpochs, code: Ints, config: Configuration) -> TimeInUse:
+    """The time before each epoch that it accounts for.
+
+    Args:
+        epochs: of one solution, in order of time.
+        code: their judgements by number, shape (epochs,).
+        config: the configuration; used are `lds` and `hazards.reaction_s`.
+
+    Returns:
+        Whether each was in use, and its times [s].
+
+    Source:
+        DOMAIN section 5.3.
     """
-    known = np.isfinite(floats(epochs, "path_m"))
+    known = epochs.positioned
     steps = _StepTimes.of(epochs, known, config)
-    usable = holds(epochs, trusted(config) & ~pl.col("withheld"))
+    usable = epochs.trusted(config.lds) & ~epochs.withheld
     in_use = np.zeros(known.size, dtype=np.bool_)
     in_use[known] = usable[known] & (steps.left_s(steps.alone_s) > _LEAST_S)
     used_s = np.zeros(known.size)
     used_s[known] = np.where(in_use[known], steps.left_s(steps.near_s), 0.0)
     wrong_s = np.where(code == WRONG, used_s, 0.0)
-    counted_s = np.where(wrong_s > 0.0, wrong_s, _counted_s(times_ns(epochs), known, steps, config))
-    return pl.DataFrame({"in_use": in_use, "used_s": used_s, "wrong_s": wrong_s, "counted_s": counted_s})
+    counted_s = np.where(wrong_s > 0.0, wrong_s, _counted_s(epochs.t_ns, known, steps, config))
+    return TimeInUse(in_use, used_s, wrong_s, counted_s)
 
 
 @frozen
@@ -242,8 +250,8 @@ class _StepTimes:
     blocked_s: Floats
 
     @classmethod
-    def of(cls, epochs: pl.DataFrame, known: Bools, config: Configuration) -> _StepTimes:
-        all_ns = times_ns(epochs)
+    def of(cls, epochs: MonitoredEpochs, known: Bools, config: Configuration) -> _StepTimes:
+        all_ns = epochs.t_ns
         t_ns = all_ns[known]
         all_s = (all_ns - all_ns[:1]) / NS_PER_S
         # Before the first position there is none: it accounts for one period of the run, as far as that is known.
@@ -253,7 +261,7 @@ class _StepTimes:
         near_s = np.minimum(step_s, gap_s)
         alone_s = np.where(period_s > 0.0, np.minimum(near_s, period_s), near_s)
         reaction_s = reactions_ns(all_ns, t_ns, config) / NS_PER_S
-        negated = _negated_spans(all_s, flags(epochs, "negated"), flags(epochs, "withheld"), reaction_s)
+        negated = _negated_spans(all_s, epochs.negated, epochs.withheld, reaction_s)
         blocked_s = np.cumsum(np.diff(negated, axis=1, prepend=negated[:, :1]).ravel())
         return cls(all_s[known], near_s, alone_s, step_s > gap_s, negated.ravel(), blocked_s)
 
@@ -288,98 +296,120 @@ def _counted_s(t_ns: Ints, known: Bools, steps: _StepTimes, config: Configuratio
     return since_s
 
 
-def lds_states(epochs: pl.DataFrame, code: Ints, in_use: Bools, undiagnosed: Bools) -> pl.Series:
+def lds_states(negated: Bools, code: Ints, in_use: Bools, undiagnosed: Bools) -> Ints:
     """P1 wrong in use, P2 negated, P3 not diagnosed, P0 right, the first that applies (DOMAIN section 4).
 
-    Null where the evidence cannot say, and where a wrong position was not in use.
+    By number in `LdsState`; -1 where the evidence cannot say, and where a wrong position was not in use.
     """
     applies = {
         LdsState.P1: (code == WRONG) & in_use,
-        LdsState.P2: flags(epochs, "negated"),
+        LdsState.P2: negated,
         LdsState.P3: undiagnosed,
         LdsState.P0: code == RIGHT,
     }
-    words = pl.Series("lds_state", [*(state.value for state in applies), None], dtype=pl.Enum(LdsState))
-    first = np.select(list(applies.values()), list(range(len(applies))), default=len(applies))
-    return words[first.astype(np.uint32)]
+    numbers = [tuple(LdsState).index(state) for state in applies]
+    return np.select(list(applies.values()), numbers, default=-1)
 
 
-def judged_epochs(given: JudgeInput, steps: OdometerSteps) -> pl.DataFrame:
-    """The epochs of the solution with evidence, judgement, direction, movement, time in use and state of the LDS."""
+def judged_epochs(given: JudgeInput, steps: OdometerSteps) -> JudgedEpochs:
+    """The epochs of the solution with evidence, judgement, direction, movement, time in use and state of the LDS.
+
+    Args:
+        given: the solution and its evidence.
+        steps: what the odometer says of the steps between its epochs.
+
+    Returns:
+        The epochs in their order; errors in the direction of travel.
+
+    Source:
+        DOMAIN sections 5.2 and 5.3.
+    """
     epochs = given.solution.epochs
     config = given.config
     at_ns = given.instants_of_epochs()
-    positions = MatchedPositions.of(given, epochs, holds(epochs, unambiguous()))
+    positions = MatchedPositions.of(epochs, given.evidence.network.track.index)
     evidence = given.evidence_at(at_ns)
     along = judgements_of(given, positions, at_ns, evidence)
-    direction = _direction(given, positions, at_ns, along)
+    has_odometer = given.odometry is not None
+    direction = travel_direction(epochs.direction, along, at_ns, epochs.path_m, has_odometer, config.hazards)
     judged = along.turned(direction)
     train_m = positions.path_m - along.known_m(config.hazards.known_error_m)
     reference_m = np.where(along.kind == REFERENCE, train_m, np.nan)
-    stood = within_spans(at_ns, given.evidence.stood)
-    accepted_ns = times_ns(given.solution.accepted)
-    odometer_m = floats(epochs, "odometer_m")
-    wrong_count = beyond_confidence(times_ns(epochs), odometer_m, train_m, along.half_m, accepted_ns, config.lds)
-    undiagnosed = flags(epochs, "diagnosis_faulty") | wrong_count
+    standing = within_spans(at_ns, given.evidence.standstills)
+    accepted_ns = given.solution.crossings.t_ns[given.solution.crossings.accepted]
+    odometer_wrong = beyond_confidence(epochs.t_ns, epochs.odometer_m, train_m, along.half_m, accepted_ns, config.lds)
+    undiagnosed = epochs.diagnosis_faulty | odometer_wrong
     use = time_in_use(epochs, along.code, config)
-    injected = under_injection(times_ns(epochs), given.faults, config.lds.recovery_s)
-    return epochs.drop("direction").with_columns(
-        pl.Series("epoch", np.arange(epochs.height)),
-        pl.Series("at", at_ns).cast(pl.Datetime("ns", "UTC")),
-        pl.Series("direction", direction, dtype=pl.Int8),
-        *judged.columns(),
-        *true_places(evidence, given.evidence.network.track),
-        pl.Series("error_along_m", judged.known_m(config.hazards.known_error_m), nan_to_null=True),
-        *cross_errors(given, floats(epochs, "heading_deg")),
-        *use,
-        (use["wrong_s"] * ~pl.Series(injected)).alias("natural_s"),
-        lds_states(epochs, along.code, flags(use, "in_use"), undiagnosed),
-        pl.Series("train_m", train_m, nan_to_null=True),
-        pl.Series("reference_m", reference_m, nan_to_null=True),
-        pl.Series("unambiguous", positions.unambiguous),
-        pl.Series("stood", stood),
-        pl.Series("odometer_wrong", wrong_count),
-        pl.Series("undiagnosed", undiagnosed),
-        moving(at_ns, reference_m, along.half_m, steps, stood, config),
+    injected = under_injection(epochs.t_ns, given.faults, config.lds.recovery_s)
+    error_cross_m, error_up_m = cross_errors(given, epochs.heading_deg)
+    moves, may_move = moving(at_ns, reference_m, along.half_m, steps, standing, config)
+    return JudgedEpochs(
+        **epochs.columns()
+        | {"direction": direction}
+        | vars(use)
+        | {
+            "epoch": np.arange(epochs.height),
+            "at_ns": at_ns,
+            "judgements": judged,
+            "true_places": true_places(evidence, given.evidence.network.track),
+            "error_along_m": judged.known_m(config.hazards.known_error_m),
+            "error_cross_m": error_cross_m,
+            "error_up_m": error_up_m,
+            "train_m": train_m,
+            "reference_m": reference_m,
+            "moves": moves,
+            "may_move": may_move,
+            "odometer_stood": standing,
+            "odometer_wrong": odometer_wrong,
+            "undiagnosed": undiagnosed,
+            "natural_s": use.wrong_s * ~injected,
+            "lds_state": lds_states(epochs.negated, along.code, use.in_use, undiagnosed),
+        }
     )
 
 
-def _direction(given: JudgeInput, positions: MatchedPositions, at_ns: Ints, along: Judgements) -> Ints:
-    as_driven = ints(given.solution.epochs["direction"], 1)
-    hazards = given.config.hazards
-    return travel_direction(as_driven, along, at_ns, positions.path_m, given.odometry is not None, hazards)
+def direction_by_evidence(
+    epochs: AlignedEpochs, path: TravelledPath, evidence: TrainEvidence, vehicle: Vehicle, config: Configuration
+) -> Ints:
+    """Direction of travel of a run without an odometer, before anything is judged; shape (epochs,)."""
+    at_ns = valid_at_ns(epochs.t_ns, vehicle)
+    index = evidence.network.track.index
+    along = judge_positions(MatchedPositions.of(epochs, index), evidence.at(at_ns), path.routes(index), config.hazards)
+    return travel_direction(epochs.direction, along, at_ns, epochs.path_m, has_odometer=False, config=config.hazards)
 
 
-def direction_by_evidence(given: JudgeInput) -> Ints:
-    """Direction of travel of a run without an odometer, before anything is judged: `epochs` as they are aligned."""
-    at_ns = given.instants_of_epochs()
-    positions = MatchedPositions.of(given, given.solution.epochs, holds(given.solution.epochs, unambiguous()))
-    along = judge_positions(positions, given.evidence_at(at_ns), given.legs(), given.config.hazards)
-    return _direction(given, positions, at_ns, along)
-
-
-def judged_offers(given: JudgeInput, epochs: pl.DataFrame) -> pl.DataFrame:
-    """The offers of the LDS, every telegram among them, as `schemas.stages.JudgedOffers`; `epochs`: judged.
+def judged_offers(given: JudgeInput, epochs: JudgedEpochs) -> JudgedOffers:
+    """The offers of the LDS, every telegram among them.
 
     Judged is the place of the balise: at the time of the telegram, or of the crossing less the GNSS latency.
+
+    Args:
+        given: the solution and its evidence.
+        epochs: its epochs as judged.
+
+    Returns:
+        The offers in order of time.
+
+    Source:
+        DOMAIN section 5.2.
     """
-    offers = given.solution.offers
+    crossings = given.solution.crossings
+    rows = given.solution.offers
+    before, epoch, t_ns = (values[rows] for values in (crossings.before, crossings.epoch, crossings.t_ns))
     hazards = given.config.hazards
-    t_ns = times_ns(offers)
-    before = ints(offers["before"])
-    sure = flags(epochs, "unambiguous")
-    positions = MatchedPositions.of(given, offers, sure[before] & sure[ints(offers["epoch"])])
-    at_ns = np.where(flags(offers, "virtual"), given.instants(t_ns), t_ns)
+    sure = epochs.unambiguous
+    index = given.evidence.network.track.index
+    positions = MatchedPositions.of_balises(crossings, rows, index, sure[before] & sure[epoch])
+    at_ns = np.where(crossings.virtual[rows], given.instants(t_ns), t_ns)
     along = judgements_of(given, positions, at_ns, given.evidence_at(at_ns))
-    judged = along.turned(ints(epochs["direction"])[before])
-    margin_m = np.where(judged.is_right, hazards.limits.failure_m - judged.largest_m, np.nan)
-    late = given.solution.passages.filter(pl.col("odometer_distance_m") > pl.col("window_close_m"))["crossing_id"]
-    return offers.select(
-        *("crossing_id", "balise_id", "t", "epoch", "path_m", "virtual", "accepted"),
-        offered=pl.col("virtual") & pl.col("offered"),
-        beyond_window=pl.col("crossing_id").is_in(late.drop_nulls().implode()),
-    ).with_columns(
-        *judged.columns(),
-        pl.Series("location_error_m", judged.known_m(hazards.known_error_m), nan_to_null=True),
-        pl.Series("proof_margin_m", margin_m, nan_to_null=True),
+    judged = along.turned(epochs.direction[before])
+    passages = given.solution.passages
+    late = passages.filter(pl.col("odometer_distance_m") > pl.col("window_close_m"))["crossing_id"]
+    return JudgedOffers.of(
+        crossings,
+        rows,
+        beyond_window=np.isin(rows, ints(late)),
+        judged=judged,
+        location_error_m=judged.known_m(hazards.known_error_m),
+        proof_margin_m=np.where(judged.is_right, hazards.limits.failure_m - judged.largest_m, np.nan),
     )

@@ -7,16 +7,14 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
-import polars as pl
 
-from pipeline.stages.judge.judgement import JUDGEMENTS, UNKNOWN, WRONG, Judgements
+from pipeline.stages.epochs.clock import crossing_gaps_ns
+from pipeline.stages.judge.judged import JUDGEMENTS, UNKNOWN, WRONG, JudgedEpochs, JudgedOffers, Judgements
 from pipeline.stages.odometry import Odometry
-from schemas.arrays import NS_PER_S, Bools, Floats, Ints, flags, floats, ints, spans_of, times_ns
+from schemas.arrays import NS_PER_S, Bools, Floats, Ints, spans_of
 from schemas.config import Configuration, HazardConfig
-from schemas.conform import dtypes
 from schemas.enums import Judgement
 from schemas.frozen import frozen
-from schemas.stages import Failures
 
 
 class PositionChanges(NamedTuple):
@@ -38,15 +36,13 @@ class Jump(NamedTuple):
     step_m: float
 
 
-def jumps_of(positions: pl.DataFrame, odometry: Odometry | None, gap_ns: Ints, config: HazardConfig) -> list[Jump]:
+def jumps_of(positions: JudgedEpochs, odometry: Odometry | None, gap_ns: Ints, config: HazardConfig) -> list[Jump]:
     """All jumps of the positions, in order of time; numbers are rows of `positions`."""
-    at_ns = times_ns(positions, "at")
-    counted_m = np.full(max(at_ns.size - 1, 0), np.nan)
+    counted_m = np.full(max(positions.height - 1, 0), np.nan)
     if odometry is not None:
-        counted_m = odometry.steps_m(at_ns)
-    places = floats(positions, "path_m"), floats(positions, "reference_m")
-    steps = steps_of(times_ns(positions), *places, counted_m, gap_ns)
-    return find_jumps(steps, ints(positions["direction"]), config)
+        counted_m = odometry.steps_m(positions.at_ns)
+    steps = steps_of(positions.t_ns, positions.path_m, positions.reference_m, counted_m, gap_ns)
+    return find_jumps(steps, positions.direction, config)
 
 
 def steps_of(t_ns: Ints, path_m: Floats, reference_m: Floats, counted_m: Floats, gap_ns: Ints) -> PositionChanges:
@@ -108,61 +104,41 @@ def _extent(steps: PositionChanges, begin: int, end: int, sign: float, config: H
 
 
 @frozen
-class Offers:
-    """Judged offers in arrays; `number`: the position, by its row, that completes each."""
-
-    balise_id: list[str]
-    number: Ints
-    t_ns: Ints
-    path_m: Floats
-    judged: Judgements
-    virtual: Bools
-    offered: Bools
-    accepted: Bools
-    beyond_window: Bools
-
-    @classmethod
-    def of(cls, offers: pl.DataFrame, positions: pl.DataFrame) -> Offers:
-        number = np.searchsorted(ints(positions["epoch"]), ints(offers["epoch"]))
-        return cls(
-            balise_id=offers["balise_id"].to_list(),
-            number=number.clip(0, max(positions.height - 1, 0)),
-            t_ns=times_ns(offers),
-            path_m=floats(offers, "path_m"),
-            judged=Judgements.of(offers),
-            **{name: flags(offers, name) for name in ("virtual", "offered", "accepted", "beyond_window")},
-        )
-
-    def between(self, begin: int, end: int) -> Bools:
-        """Those that positions `begin` to `end` complete."""
-        return np.logical_and(self.number >= begin, self.number < end)
-
-    def worst_accepted(self, begin: int, end: int) -> Judgement:
-        """The worst judgement of the VBs accepted at positions `begin` to `end`; right where none was."""
-        codes = self.judged.code[self.accepted & self.between(begin, end)]
-        return next((JUDGEMENTS[code] for code in (WRONG, UNKNOWN) if code in codes), Judgement.RIGHT)
-
-
-@frozen
 class ErrorHistory:
     """The positions in order of time, with the jumps between them and the offers; numbers are rows of `positions`.
 
     `settled_from`: the first position from each on at which the error stays within half the limit for long enough;
-    `within_noise`: noise explains the error.
+    `within_noise`: noise explains the error. `completing`: of each offer the position that completes it.
     """
 
-    positions: pl.DataFrame
-    t_ns: Ints
-    judged: Judgements
+    positions: JudgedEpochs
     settled_from: Ints
     within_noise: Bools
     jumps: Sequence[Jump]
-    offers: Offers
+    offers: JudgedOffers
+    completing: Ints
     config: Configuration
 
     @property
     def size(self) -> int:
-        return self.t_ns.size
+        return self.positions.height
+
+    @property
+    def t_ns(self) -> Ints:
+        return self.positions.t_ns
+
+    @property
+    def judged(self) -> Judgements:
+        return self.positions.judgements
+
+    def offers_between(self, begin: int, end: int) -> Bools:
+        """Offers that positions `begin` to `end` complete; shape (offers,)."""
+        return np.logical_and(self.completing >= begin, self.completing < end)
+
+    def worst_accepted(self, begin: int, end: int) -> Judgement:
+        """The worst judgement of the VBs accepted at positions `begin` to `end`; right where none was."""
+        codes = self.offers.judged.code[self.offers.accepted & self.offers_between(begin, end)]
+        return next((JUDGEMENTS[code] for code in (WRONG, UNKNOWN) if code in codes), Judgement.RIGHT)
 
     def jumps_in(self, begin: int, end: int) -> list[Jump]:
         """Jumps, in order of time, that end at `begin` or later and begin before `end`."""
@@ -171,46 +147,43 @@ class ErrorHistory:
         return [jump for jump in self.jumps[max(first - 1, 0) : last] if jump.last >= begin]
 
     def after_noise(self, floor: int, number: int) -> int:
-        """The position after the last quiet one between `floor` and a position."""
+        """The position after the last one within noise between `floor` and a position."""
         within_noise = np.flatnonzero(self.within_noise[floor:number])
         return floor + int(within_noise[-1]) + 1 if within_noise.size else floor
 
 
-def positions_of(epochs: pl.DataFrame) -> pl.DataFrame:
-    """The judged epochs that have a position."""
-    return epochs.select(_POSITION_COLUMNS).filter(pl.col("path_m").is_not_null())
-
-
-_POSITION_COLUMNS = (
-    *("t", "leg", "path_m", "sigma_along_m", "epoch", "at", "direction", "judgement", "error_low_m", "error_high_m"),
-    *("evidence", "wrong_track", "track_assumed", "used_s", "wrong_s", "natural_s", "train_m", "reference_m"),
-)
-
-
 def error_history_of(
-    positions: pl.DataFrame, offers: pl.DataFrame, jumps: Sequence[Jump], config: Configuration
+    epochs: JudgedEpochs, offers: JudgedOffers, odometry: Odometry | None, config: Configuration
 ) -> ErrorHistory:
-    t_ns = times_ns(positions)
-    judged = Judgements.of(positions)
+    """Of the positions among judged epochs."""
+    positions = epochs.where(np.flatnonzero(epochs.positioned))
+    jumps = jumps_of(positions, odometry, crossing_gaps_ns(positions.t_ns, config.lds), config.hazards)
+    return history_of(positions, offers, jumps, config)
+
+
+def history_of(
+    positions: JudgedEpochs, offers: JudgedOffers, jumps: Sequence[Jump], config: Configuration
+) -> ErrorHistory:
+    """Of judged positions; `jumps` in their numbers."""
+    completing = np.searchsorted(positions.epoch, offers.epoch)
     return ErrorHistory(
         positions=positions,
-        t_ns=t_ns,
-        judged=judged,
-        settled_from=_settled_from(t_ns, judged, config.hazards),
-        within_noise=_is_within_noise(judged, floats(positions, "sigma_along_m"), config.hazards),
+        settled_from=_settled_from(positions.t_ns, positions.judgements, config.hazards),
+        within_noise=_is_within_noise(positions.judgements, positions.sigma_along_m, config.hazards),
         jumps=jumps,
-        offers=Offers.of(offers, positions),
+        offers=offers,
+        completing=completing.clip(0, max(positions.height - 1, 0)),
         config=config,
     )
 
 
 def _settled_from(t_ns: Ints, judged: Judgements, config: HazardConfig) -> Ints:
-    """`ErrorHistory.calm_from`: from each position on, the first that begins `episode_end_s` within half the limit."""
+    """From each position on the first that begins `episode_end_s` within half the limit."""
     settled = (judged.largest_m <= config.limits.settled_m) & ~judged.is_wrong
     hold_ns = round(config.episode_end_s * NS_PER_S)
     begins = np.full(t_ns.size, t_ns.size)
     for first, last in spans_of(settled):
-        # The positions of a calm span up to here have `hold_ns` of it ahead of them.
+        # The positions of a settled span up to here have `hold_ns` of it ahead of them.
         after_last = int(np.searchsorted(t_ns, t_ns[last] - hold_ns, side="right"))
         begins[first:after_last] = np.arange(first, max(first, after_last))
     return np.asarray(np.minimum.accumulate(begins[::-1])[::-1])
@@ -228,7 +201,10 @@ def _is_within_noise(judged: Judgements, sigma_m: Floats, config: HazardConfig) 
 class Failure:
     """Positions `begin` to `end` (the first after it), those judged wrong in use `first` to `last`; for how long.
 
-    `natural_s`: what no injected fault of GNSS explains of `hazardous_s`.
+    Judged wrong in use, over pulses, whether it crosses a VB or not (DOMAIN section 5.3). `hazardous_s`: time judged
+    wrong in use; `natural_s`: of it what no injected fault of GNSS explains; `hazardous_may_s`: the same with the time
+    that is unknown; `accepted`: the worst judgement of the VBs accepted in it; `within_budget`: None where it cannot be
+    said.
     """
 
     begin: int
@@ -245,15 +221,24 @@ class Failure:
 def find_failures(history: ErrorHistory) -> list[Failure]:
     """Wrong positions in use, in order of time.
 
-    Two belong to one failure where less than `recovery_s` lies between them, or no calm position does.
+    Two belong to one failure where less than `recovery_s` lies between them, or no settled position does.
+
+    Args:
+        history: the positions, judged.
+
+    Returns:
+        One for each time that positions were wrong in use.
+
+    Source:
+        DOMAIN section 5.3.
     """
-    wrong = np.flatnonzero(floats(history.positions, "wrong_s") > 0.0)
+    wrong = np.flatnonzero(history.positions.wrong_s > 0.0)
     if wrong.size == 0:
         return []
     apart = np.diff(history.t_ns[wrong]) >= history.config.lds.recovery_s * NS_PER_S
-    calm_between = history.settled_from[wrong[:-1]] < wrong[1:]
+    settled_between = history.settled_from[wrong[:-1]] < wrong[1:]
     failures: list[Failure] = []
-    for part in np.split(wrong, np.flatnonzero(apart & calm_between) + 1):
+    for part in np.split(wrong, np.flatnonzero(apart & settled_between) + 1):
         begin = history.after_noise(failures[-1].end if failures else 0, int(part[0]))
         failures.append(failure_at(history, begin, int(history.settled_from[part[-1]]), part))
     return failures
@@ -261,19 +246,20 @@ def find_failures(history: ErrorHistory) -> list[Failure]:
 
 def failure_at(history: ErrorHistory, begin: int, end: int, wrong: Ints) -> Failure:
     """Positions `begin` to `end` as a failure; `wrong`: those judged wrong in use, maybe none."""
-    hazardous_s, natural_s = (float(floats(history.positions, name)[wrong].sum()) for name in ("wrong_s", "natural_s"))
+    positions = history.positions
+    hazardous_s, natural_s = (float(time_s[wrong].sum()) for time_s in (positions.wrong_s, positions.natural_s))
     may_be_wrong = ~history.judged.is_right[begin:end]
-    may_s = float(floats(history.positions, "used_s")[begin:end][may_be_wrong].sum())
-    accepted = history.offers.worst_accepted(begin, end)
+    may_s = float(positions.used_s[begin:end][may_be_wrong].sum())
+    accepted = history.worst_accepted(begin, end)
     within = within_budget(hazardous_s, may_s, accepted, history.config.budget_s)
     first, last = (int(wrong[0]), int(wrong[-1])) if wrong.size else (begin, end)
     return Failure(begin, first, last, end, hazardous_s, natural_s, may_s, accepted, within)
 
 
-def failures_within(epochs: pl.DataFrame, offers: pl.DataFrame, config: Configuration) -> pl.DataFrame:
+def failures_within(epochs: JudgedEpochs, offers: JudgedOffers, config: Configuration) -> list[Failure]:
     """The failures of a part of the epochs judged, as if it were all."""
-    history = error_history_of(positions_of(epochs), offers, (), config)
-    return failures_table(find_failures(history), history)
+    positions = epochs.where(np.flatnonzero(epochs.positioned))
+    return find_failures(history_of(positions, offers, (), config))
 
 
 def within_budget(hazardous_s: float, hazardous_may_s: float, accepted: Judgement, budget_s: float) -> bool | None:
@@ -281,18 +267,3 @@ def within_budget(hazardous_s: float, hazardous_may_s: float, accepted: Judgemen
     if accepted is Judgement.WRONG or hazardous_s > budget_s:
         return False
     return True if hazardous_may_s <= budget_s and accepted is Judgement.RIGHT else None
-
-
-def failures_table(failures: Sequence[Failure], history: ErrorHistory) -> pl.DataFrame:
-    """One row per failure: frame as `schemas.stages.Failures`."""
-    rows = [
-        vars(failure)
-        | {
-            "t_start": int(history.t_ns[failure.begin]),
-            "t_end": int(history.t_ns[min(failure.end, history.size - 1)]),
-            "accepted": failure.accepted.value,
-        }
-        for failure in failures
-    ]
-    schema = dtypes(Failures)
-    return pl.DataFrame([[row[name] for name in schema] for row in rows], schema=schema, orient="row")

@@ -13,7 +13,8 @@ from pipeline.stages.epochs.clock import reactions_ns
 from pipeline.stages.evidence.evidence import KINDS
 from pipeline.stages.judge.episodes import Episode, suspect_of
 from pipeline.stages.judge.epochs import speed_at
-from pipeline.stages.judge.failures import ErrorHistory, Jump, Offers
+from pipeline.stages.judge.failures import ErrorHistory, Jump
+from pipeline.stages.judge.judged import JudgedEpochs, JudgedOffers
 from pipeline.stages.judge.judgement import JudgeInput
 from schemas.arrays import NS_PER_S
 from schemas.conform import dtypes, table_of_rows
@@ -37,7 +38,18 @@ class HazardRow:
 
 
 def hazard_rows(episodes: Iterable[Episode], history: ErrorHistory) -> list[HazardRow]:
-    """At most one row per episode and class, and one for VBs that the jump back crosses; in order of time."""
+    """At most one row per episode and class, and one for VBs that the jump back crosses.
+
+    Args:
+        episodes: faults in order of time.
+        history: the positions and offers that they are of.
+
+    Returns:
+        Rows in order of time.
+
+    Source:
+        DIAG, VB Jump and VB Shift; DOMAIN section 5.3.
+    """
     return [row for episode in episodes for row in _of_episode(episode, history)]
 
 
@@ -46,8 +58,8 @@ def _of_episode(episode: Episode, history: ErrorHistory) -> list[HazardRow]:
     crossed = {hit for row in by_class.values() for hit in row.crossed}
     for hit in _hits(episode, history):
         if hit not in crossed:
-            astray = history.offers.judged.wrong_track[hit]
-            hazard = Hazard.VB_WRONG_TRACK if astray else min(by_class.keys() & _JUMPS, default=Hazard.VB_SHIFT)
+            on_other_track = history.offers.judged.wrong_track[hit]
+            hazard = Hazard.VB_WRONG_TRACK if on_other_track else min(by_class.keys() & _JUMPS, default=Hazard.VB_SHIFT)
             by_class.setdefault(hazard, HazardRow(hazard, episode)).hits.append(hit)
     rows = sorted(by_class.values(), key=lambda row: t_hazard_ns(row, history))
     back = episode.jump_back
@@ -75,29 +87,32 @@ def _hits(episode: Episode, history: ErrorHistory) -> list[int]:
     """Offers judged wrong during the episode, beyond the shift limit or on another track."""
     offers = history.offers
     beyond = (offers.judged.least_m > history.config.hazards.limits.shift_m) | offers.judged.wrong_track
-    wrong = offers.offered & offers.judged.is_wrong & offers.between(episode.onset, episode.end)
+    wrong = offers.offered & offers.judged.is_wrong & history.offers_between(episode.onset, episode.end)
     return np.flatnonzero(beyond & wrong).tolist()
 
 
 def crossed_by(jump: Jump, history: ErrorHistory) -> list[int]:
-    """Virtual balises on the way of a jump that the train's own step does not cross."""
+    """Virtual balises between the ends of a jump that the train's own step does not cross."""
     offers = history.offers
-    on_the_way = np.flatnonzero(offers.virtual & offers.between(jump.first, jump.last + 1))
-    if on_the_way.size == 0:
+    between = np.flatnonzero(offers.virtual & history.offers_between(jump.first, jump.last + 1))
+    if between.size == 0:
         return []
-    before, after = (history.positions.row(number, named=True) for number in (jump.first - 1, jump.last))
-    step_m = jump.step_m * after["direction"]
+    positions = history.positions
+    before, after = jump.first - 1, jump.last
+    step_m = jump.step_m * int(positions.direction[after])
+    train_m = float(positions.train_m[before])
     # Where the train was is better known by the evidence than by the position before the jump.
-    start_m = before["path_m"] if before["train_m"] is None else before["train_m"]
-    low_m, high_m = sorted((start_m, start_m + (after["path_m"] - before["path_m"]) - step_m))
-    return [hit for hit in on_the_way.tolist() if not low_m <= offers.path_m[hit] <= high_m]
+    path_m = [float(positions.path_m[number]) for number in (before, after)]
+    start_m = path_m[0] if np.isnan(train_m) else train_m
+    low_m, high_m = sorted((start_m, start_m + (path_m[1] - path_m[0]) - step_m))
+    return [hit for hit in between.tolist() if not low_m <= offers.path_m[hit] <= high_m]
 
 
-def _class_of(crossed: list[int], offers: Offers) -> Hazard:
+def _class_of(crossed: list[int], offers: JudgedOffers) -> Hazard:
     return Hazard.VB_JUMP_1A if len(_names(crossed, offers)) > 1 else Hazard.VB_JUMP_1B
 
 
-def _names(hits: list[int], offers: Offers) -> list[str]:
+def _names(hits: list[int], offers: JudgedOffers) -> list[str]:
     return list(dict.fromkeys(offers.balise_id[hit] for hit in hits))
 
 
@@ -139,9 +154,19 @@ def rate_mps(row: HazardRow, history: ErrorHistory) -> float | None:
 
 
 def hazards_table(
-    rows: Sequence[HazardRow], given: JudgeInput, epochs: pl.DataFrame, history: ErrorHistory
+    rows: Sequence[HazardRow], given: JudgeInput, epochs: JudgedEpochs, history: ErrorHistory
 ) -> pl.DataFrame:
-    """Rows in order of time; `hazard_id` is the place in `rows`; `epochs`: judged."""
+    """The hazards of a solution as a table.
+
+    Args:
+        rows: hazards in order of time; `hazard_id` is the place among them.
+        given: the solution.
+        epochs: its epochs as judged.
+        history: the positions and offers that the rows are of.
+
+    Returns:
+        Rows of `schemas.tables.Hazards`.
+    """
     ids = {id(row): number for number, row in enumerate(rows)}
     values = [
         {
@@ -165,7 +190,7 @@ def hazards_table(
     return table_of_rows(values, dtypes(Hazards))
 
 
-def _kind(row: HazardRow, offers: Offers) -> Row:
+def _kind(row: HazardRow, offers: JudgedOffers) -> Row:
     """Class, failure mode and timing, and the VBs hit; accepted ones by their own list."""
     error_m = float(offers.judged.middle_m[row.hits[0]])
     timing = Timing.EARLY if error_m > 0.0 else Timing.LATE if error_m < 0.0 else Timing.NONE
@@ -219,12 +244,13 @@ def _seconds(begin_ns: int | None, end_ns: int | None) -> float | None:
     return None if begin_ns is None or end_ns is None else (end_ns - begin_ns) / NS_PER_S
 
 
-def _place(row: HazardRow, given: JudgeInput, epochs: pl.DataFrame, history: ErrorHistory) -> Row:
+def _place(row: HazardRow, given: JudgeInput, epochs: JudgedEpochs, history: ErrorHistory) -> Row:
     """Where the train was at the hazard, and how fast it went; null where nobody knows."""
-    number = int(history.offers.number[row.hits[0]]) if row.jump is None else row.jump.first
-    there = history.positions.row(number, named=True)
-    path_m = there["path_m"] - there["direction"] * float(history.judged.middle_m[number])
-    names, measures_m = given.solution.path.locate(max(there["leg"], 0), path_m)
+    number = int(history.completing[row.hits[0]]) if row.jump is None else row.jump.first
+    positions = history.positions
+    away_m = int(positions.direction[number]) * float(positions.judgements.middle_m[number])
+    path_m = float(positions.path_m[number]) - away_m
+    names, measures_m = given.solution.path.locate(max(int(positions.leg[number]), 0), path_m)
     speed_mps = speed_at(epochs, np.array([t_hazard_ns(row, history)]))
     figures = {"measure_m": measures_m[0], "path_m": path_m, "speed_mps": speed_mps[0]}
     known = {name: None if np.isnan(value) else float(value) for name, value in figures.items()}

@@ -2,30 +2,44 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from enum import StrEnum
 from typing import Any, NamedTuple
 
 import numpy as np
 import polars as pl
 
-from pipeline.stages.epochs.clock import crossing_gaps_ns, holds, passings
+from pipeline.stages.epochs.clock import crossing_gaps_ns, passings
 from pipeline.stages.epochs.verdicts import failure_log
-from pipeline.stages.evidence.evidence import NOTHING, Alternative, EvidenceSet, Span, within_spans
+from pipeline.stages.evidence.evidence import KINDS, NOTHING, Alternative, EvidenceSet, Span, within_spans
 from pipeline.stages.judge.episodes import alarms_table, find_episodes
 from pipeline.stages.judge.epochs import judged_epochs, judged_offers, odometer_steps, speed_at
-from pipeline.stages.judge.failures import error_history_of, failures_table, find_failures, jumps_of, positions_of
+from pipeline.stages.judge.failures import Failure, error_history_of, find_failures
 from pipeline.stages.judge.hazards import HazardRow, hazard_rows, hazards_table
-from pipeline.stages.judge.judgement import JudgeInput, Judgements
+from pipeline.stages.judge.judged import JudgedEpochs, JudgedOffers
+from pipeline.stages.judge.judgement import JudgeInput
 from pipeline.stages.track.path import Place
-from schemas.arrays import NS_PER_S, Bools, Floats, Ints, flags, ints, times_ns
+from schemas.arrays import NS_PER_S, Bools, Floats, Ints, ints, truths
 from schemas.config import Configuration, LdsConfig
-from schemas.enums import BaliseKind, Cause, Direction, Evidence, FailureMode, LinkingError, PassageStatus, Reaction
+from schemas.conform import dtypes
+from schemas.enums import (
+    BaliseKind,
+    Cause,
+    Direction,
+    Evidence,
+    FailureMode,
+    Judgement,
+    LinkingError,
+    PassageStatus,
+    Reaction,
+)
 from schemas.frozen import frozen
+from schemas.stages import AlignedEpochs
 from schemas.tables import Passages
 
 # Numerics: so many instants before and after a track show where the train came from and went on to.
-_BESIDE = 100
+_NEIGHBOURS = 100
 
 
 class TrueCrossing(NamedTuple):
@@ -44,14 +58,22 @@ Crossings = dict[str, list[TrueCrossing]]
 
 
 def crossings_of(given: JudgeInput) -> Crossings:
-    """Crossings of each balise of the path by the train, in a direction in which the balise is valid."""
+    """Crossings of each balise of the path by the train, in a direction in which the balise is valid.
+
+    Args:
+        given: the balises of the path, and the evidence.
+
+    Returns:
+        Crossings of each balise in order of time.
+    """
     balises = given.solution.balises.unique("balise_id", keep="first")
-    elements = given.element_numbers(balises["netelement_id"]).tolist()
+    index = given.evidence.network.track.index
+    elements = [index.get(name, -1) for name in balises["netelement_id"]]
     spots = zip(balises["balise_id"], elements, balises["measure_m"], strict=True)
     places = {name: Place(element, measure_m) for name, element, measure_m in spots}
     at_ns = between_far_epochs(given.instants_of_epochs(), given.config.align.speed_window_s)
     crossings = true_crossings(at_ns, given.evidence.at(at_ns), places, given.config)
-    # `valid_direction` is along the path, `sense` of a crossing along the measure; 0 is both ways.
+    # `valid_direction` is along the path, `sense` of a crossing along the measure; 0 is both directions.
     valid = dict(balises.select("balise_id", pl.col("valid_direction") * pl.col("sense")).iter_rows())
     return {
         name: [crossing for crossing in crossed if valid[name] in (0, crossing.sense)]
@@ -98,7 +120,7 @@ def true_crossings(t_ns: Ints, evidence: EvidenceSet, places: dict[str, Place], 
     for track in tracks:
         if track.rows.size == 0:
             continue
-        rows, at_m = _with_beside(track, train)
+        rows, at_m = _with_neighbours(track, train)
         on_track = np.isin(rows, track.rows)
         for balise, visit_m, sense in zip(*track.route.places(elements, measures_m), strict=True):
             if at_m.min() <= visit_m <= at_m.max():
@@ -108,16 +130,16 @@ def true_crossings(t_ns: Ints, evidence: EvidenceSet, places: dict[str, Place], 
     return {name: sorted(crossed) for name, crossed in crossings.items()}
 
 
-def _with_beside(track: Alternative, train: _Train) -> tuple[Ints, Floats]:
+def _with_neighbours(track: Alternative, train: _Train) -> tuple[Ints, Floats]:
     """Rows and coordinates on a track, also of the rows just before and after, where the train's place lies on it."""
     rows = track.rows
-    around = np.arange(max(rows[0] - _BESIDE, 0), min(rows[-1] + _BESIDE + 1, train.t_ns.size))
-    beside = np.setdiff1d(around, rows)
-    element = np.nan_to_num(train.element[beside], nan=-1).astype(np.int64)
-    near_m = track.middle_m[np.searchsorted(rows, beside).clip(0, rows.size - 1)]
-    there_m, _ = track.route.coordinate(element, train.measure_m[beside], near_m)
+    around = np.arange(max(rows[0] - _NEIGHBOURS, 0), min(rows[-1] + _NEIGHBOURS + 1, train.t_ns.size))
+    neighbours = np.setdiff1d(around, rows)
+    element = np.nan_to_num(train.element[neighbours], nan=-1).astype(np.int64)
+    near_m = track.middle_m[np.searchsorted(rows, neighbours).clip(0, rows.size - 1)]
+    there_m, _ = track.route.coordinate(element, train.measure_m[neighbours], near_m)
     known = np.isfinite(there_m)
-    both = np.concatenate([rows, beside[known]])
+    both = np.concatenate([rows, neighbours[known]])
     order = np.argsort(both, kind="stable")
     return both[order], np.concatenate([track.middle_m, there_m[known]])[order]
 
@@ -154,49 +176,80 @@ def _crossed(train: _Train, rows: Ints, on_track: Bools, away_m: Floats, config:
 
 
 def passages_table(
-    given: JudgeInput, epochs: pl.DataFrame, offers: pl.DataFrame, rows: Sequence[HazardRow], undetected: Sequence[Span]
+    given: JudgeInput,
+    epochs: JudgedEpochs,
+    offers: JudgedOffers,
+    rows: Sequence[HazardRow],
+    undetected: Sequence[Span],
 ) -> pl.DataFrame:
     """Passages of the LDS, and those of the train that it knows nothing of, with the columns of the evidence.
 
-    `epochs`, `offers`: judged; `undetected`: from each fault's onset to its detection.
+    Args:
+        given: the solution and its evidence.
+        epochs: its epochs as judged.
+        offers: its offers as judged; a passage finds its own by `crossing_id`.
+        rows: hazards, for the numbers of those that hit a passage.
+        undetected: spans from each fault's onset to its detection [ns].
+
+    Returns:
+        Rows of `schemas.tables.Passages`, in order of time.
+
+    Source:
+        CONTRACT section 3; SUBSET-026 3.4.4.
     """
-    stamps = times_ns(epochs.filter(pl.col("path_m").is_not_null()))
+    stamps = epochs.t_ns[epochs.positioned]
     crossings = crossings_of(given)
     known = given.solution.passages.with_columns(_true_times(given.solution.passages, crossings))
     passages = _with_unoffered(known, given, crossings, stamps)
     t_true = passages["t_true"]
-    accepted = (pl.col("status") == PassageStatus.ACCEPTED.value) & (pl.col("kind") == BaliseKind.VIRTUAL.value)
+    virtual = _are(passages["kind"], BaliseKind.VIRTUAL)
+    accepted = virtual & _are(passages["status"], PassageStatus.ACCEPTED)
     offered_ns = ints(passages["t_offered"].dt.timestamp("ns"))
+    positioned = _within_gap(stamps, ints(t_true), given.config.lds) & t_true.is_not_null().to_numpy()
+    of_offers, inserted = _of_offers(passages, offers, rows)
     frame = passages.with_columns(
-        pl.col("t_true").cast(pl.Datetime("ns", "UTC")),
-        *_of_offers(passages, offers, rows),
+        t_true.cast(pl.Datetime("ns", "UTC")),
+        *of_offers,
         _speeds(passages, t_true, epochs, given.config.lds),
-        _positioned=pl.Series(_within_gap(stamps, ints(t_true), given.config.lds)) & t_true.is_not_null(),
-        suspect_after_the_fact=pl.Series(holds(passages, accepted) & within_spans(offered_ns, undetected)),
+        pl.Series("suspect_after_the_fact", accepted & within_spans(offered_ns, undetected)),
     )
-    return _with_failures(frame).select(Passages.column_names())
+    return frame.with_columns(failures_of(frame, inserted, positioned)).select(Passages.column_names())
 
 
-def _of_offers(passages: pl.DataFrame, offers: pl.DataFrame, rows: Sequence[HazardRow]) -> pl.DataFrame:
-    """Judgement, error, hazard and insertion from the offer of each passage; from a telegram its error alone.
+def _are(words: pl.Series, word: StrEnum) -> Bools:
+    """Where a column of words has this one; null is false."""
+    return truths(words == word.value)
+
+
+def _of_offers(
+    passages: pl.DataFrame, offers: JudgedOffers, rows: Sequence[HazardRow]
+) -> tuple[list[pl.Series], Bools]:
+    """Judgement, error and hazard from the offer of each passage, from a telegram its error alone; what was inserted.
 
     Inserted: by a jump, on another track, or early and wrong.
     """
-    judged = Judgements.of(offers)
-    hazard = np.full(offers.height, NOTHING)
+    judged = offers.judged
+    hazard = np.full(offers.size, NOTHING)
     inserted = judged.is_wrong & ((judged.low_m > 0.0) | judged.wrong_track)
     for number, row in reversed(list(enumerate(rows))):
         hazard[row.hits] = number
         inserted[row.crossed] = True
-    of_virtual = ("judgement", "error_low_m", "error_high_m", "evidence", "proof_margin_m")
-    columns = offers.select(
-        *("crossing_id", "location_error_m"),
-        *(pl.when("virtual").then(pl.col(name)).alias(name) for name in of_virtual),
-        hazard_id=pl.Series(hazard).replace(NOTHING, None),
-        _inserted=pl.Series(inserted),
-    )
-    joined = passages.select("crossing_id").join(columns, on="crossing_id", how="left", maintain_order="left")
-    return joined.drop("crossing_id").with_columns(pl.col("_inserted").fill_null(value=False))
+    place = {crossing: number for number, crossing in enumerate(offers.crossing_id.tolist())}
+    at = np.array([place.get(crossing, NOTHING) for crossing in passages["crossing_id"]], dtype=np.int64)
+    of_offer = _known(at)
+    of_virtual = _known(np.where(np.append(offers.virtual, False)[at], at, NOTHING))
+    columns = [
+        pl.Series("location_error_m", offers.location_error_m, nan_to_null=True).gather(of_offer),
+        _known(hazard).alias("hazard_id").gather(of_offer),
+        *(column.gather(of_virtual) for column in judged.columns()),
+        pl.Series("proof_margin_m", offers.proof_margin_m, nan_to_null=True).gather(of_virtual),
+    ]
+    return columns, np.append(inserted, False)[at]
+
+
+def _known(numbers: Ints) -> pl.Series:
+    """Numbers as a column, null for `NOTHING`."""
+    return pl.Series(numbers, dtype=pl.Int64).replace(NOTHING, None)
 
 
 def _true_times(passages: pl.DataFrame, crossings: Crossings) -> pl.Series:
@@ -232,33 +285,38 @@ def _within_gap(stamps: Ints, t_ns: Ints, lds: LdsConfig) -> Bools:
     return np.asarray(inside & (stamps[after] - stamps[after - 1] <= crossing_gaps_ns(stamps, lds)[after]))
 
 
-def _speeds(passages: pl.DataFrame, t_true: pl.Series, epochs: pl.DataFrame, lds: LdsConfig) -> pl.Series:
+def _speeds(passages: pl.DataFrame, t_true: pl.Series, epochs: AlignedEpochs, lds: LdsConfig) -> pl.Series:
     """Speed of the train at the offer, else where it passed [m/s]; null in a gap of the epochs."""
     at = passages["t_offered"].dt.timestamp("ns").fill_null(t_true)
-    stamps = times_ns(epochs.filter(pl.col("speed_mps").is_not_null()))
+    stamps = epochs.t_ns[np.isfinite(epochs.speed_mps)]
     known = at.is_not_null().to_numpy() & _within_gap(stamps, ints(at), lds)
     return pl.Series("speed_mps", np.where(known, speed_at(epochs, ints(at)), np.nan), nan_to_null=True)
 
 
-def _with_failures(frame: pl.DataFrame) -> pl.DataFrame:
-    """ETCS failure mode and cause: insertion where offered where it is not, deletion where not offered in time."""
-    beyond_window = (pl.col("odometer_distance_m") > pl.col("window_close_m")).fill_null(value=False)
-    offered = pl.col("t_offered").is_not_null()
-    wrong = (pl.col("judgement") == "wrong").fill_null(value=False)
-    absent = pl.col("status") == PassageStatus.NOT_AVAILABLE.value
-    insertion = offered & pl.col("_inserted")
+def failures_of(passages: pl.DataFrame, inserted: Bools, positioned: Bools) -> list[pl.Series]:
+    """ETCS failure mode and cause of each passage; shape (passages,).
+
+    Insertion where offered where it is not, deletion where not offered in time. `inserted`: by what the judge says of
+    the offer; `positioned`: the train had positions where it passed.
+    """
+    beyond_window = truths(passages["odometer_distance_m"] > passages["window_close_m"])
+    offered = passages["t_offered"].is_not_null().to_numpy()
+    wrong = _are(passages["judgement"], Judgement.WRONG)
+    absent = _are(passages["status"], PassageStatus.NOT_AVAILABLE)
+    insertion = offered & inserted
     deletion = absent | ~offered | beyond_window
-    by_position = insertion | (beyond_window & wrong) | (~offered & ~absent & pl.col("_positioned"))
-    without = absent | (~offered & ~pl.col("_positioned"))
-    mode = _first_of(insertion, FailureMode.INSERTION, deletion, FailureMode.DELETION)
-    cause = _first_of(by_position, Cause.POSITION, without, Cause.NO_POSITION)
-    kinds = frame.schema
-    return frame.with_columns(failure_mode=mode.cast(kinds["failure_mode"]), cause=cause.cast(kinds["cause"]))
+    by_position = insertion | (beyond_window & wrong) | (~offered & ~absent & positioned)
+    without = absent | (~offered & ~positioned)
+    modes: dict[StrEnum, Bools] = {FailureMode.INSERTION: insertion, FailureMode.DELETION: deletion}
+    causes: dict[StrEnum, Bools] = {Cause.POSITION: by_position, Cause.NO_POSITION: without}
+    return [_first_of("failure_mode", modes, FailureMode.NONE), _first_of("cause", causes, Cause.NONE)]
 
 
-def _first_of(first: pl.Expr, word: FailureMode | Cause, second: pl.Expr, other: FailureMode | Cause) -> pl.Expr:
-    """The word of the first condition that holds, `none` where neither does."""
-    return pl.when(first).then(pl.lit(word.value)).when(second).then(pl.lit(other.value)).otherwise(pl.lit("none"))
+def _first_of(name: str, conditions: Mapping[StrEnum, Bools], otherwise: StrEnum) -> pl.Series:
+    """The word of the first condition that holds."""
+    words = [*conditions, otherwise]
+    first = np.select(list(conditions.values()), range(len(conditions)), default=len(conditions))
+    return pl.Series(name, [words[number].value for number in first], dtype=dtypes(Passages)[name])
 
 
 def _with_unoffered(passages: pl.DataFrame, given: JudgeInput, crossings: Crossings, stamps: Ints) -> pl.DataFrame:
@@ -277,7 +335,7 @@ def _with_unoffered(passages: pl.DataFrame, given: JudgeInput, crossings: Crossi
         return passages
     times = np.array([crossing.t_ns for _, crossing in missed])
     positioned = _within_gap(stamps, times, given.config.lds).tolist()
-    rows = [_unoffered(*pair, given.solution.name, seen) for pair, seen in zip(missed, positioned, strict=True)]
+    rows = [_unoffered(*pair, given.solution.name, known) for pair, known in zip(missed, positioned, strict=True)]
     added = pl.DataFrame(rows, schema=passages.schema)
     when = pl.coalesce("t_offered", "t_reckoned")
     ordered = passages.with_columns(_when=when.forward_fill().backward_fill())
@@ -302,62 +360,70 @@ def _unoffered(balise: dict[str, Any], crossing: TrueCrossing, solution: str, po
 
 @frozen
 class Judged:
-    """Tables by the contract, and the frames that they were read from (`schemas.stages`).
+    """Tables by the contract, and the arrays that they were read from.
 
-    `distance_m`: way driven; `evidence`: what most epochs rest on.
+    `distance_m`: driven; `evidence`: what most epochs rest on.
     """
 
     hazards: pl.DataFrame
     alarms: pl.DataFrame
     passages: pl.DataFrame
-    failures: pl.DataFrame
-    epochs: pl.DataFrame
-    offers: pl.DataFrame
+    failures: Sequence[Failure]
+    epochs: JudgedEpochs
+    offers: JudgedOffers
+    suspect_after_the_fact: Bools
     distance_m: float | None
     evidence: Evidence | None
 
 
 def judge(given: JudgeInput) -> Judged:
-    """Judge one solution: epochs, offers, jumps, failures, episodes, then the rows."""
+    """Judge one solution: epochs, offers, jumps, failures, episodes, then the rows.
+
+    Args:
+        given: the solution as it was replayed, the evidence of its run, and its odometer.
+
+    Returns:
+        Hazards, alarms and passages as tables, and what was judged in arrays.
+
+    Source:
+        DOMAIN sections 5.2 to 5.5; DIAG, hazards.
+    """
     config = given.config
     steps = odometer_steps(given)
-    given = replace(given, evidence=replace(given.evidence, stood=steps.stood))
+    given = replace(given, evidence=replace(given.evidence, standstills=steps.standstills))
     epochs = judged_epochs(given, steps)
     offers = judged_offers(given, epochs)
-    positions = positions_of(epochs)
-    gap_ns = crossing_gaps_ns(times_ns(positions), config.lds)
-    history = error_history_of(positions, offers, jumps_of(positions, given.odometry, gap_ns, config.hazards), config)
+    history = error_history_of(epochs, offers, given.odometry, config)
     failures = find_failures(history)
-    log = failure_log(given.solution.epochs, config.lds.recovery_s)
+    log = failure_log(epochs.t_ns, epochs.negated, epochs.verdicts, config.lds.recovery_s)
     episodes = find_episodes(history, failures, log, given.faults)
     rows = hazard_rows(episodes, history)
     # From a fault's onset to its detection.
     undetected = [episode.undetected_ns for episode in episodes]
-    suspect_after = within_spans(times_ns(epochs), undetected) & flags(epochs, "tvb")
     return Judged(
         hazards=hazards_table(rows, given, epochs, history),
         alarms=alarms_table(given.solution.name, epochs, log, [row.episode for row in rows], config),
         passages=passages_table(given, epochs, offers, rows, undetected),
-        failures=failures_table(failures, history),
-        epochs=epochs.with_columns(pl.Series("suspect_after_the_fact", suspect_after)),
+        failures=failures,
+        epochs=epochs,
         offers=offers,
+        suspect_after_the_fact=within_spans(epochs.t_ns, undetected) & epochs.tvb,
         distance_m=_distance_m(given, epochs),
-        evidence=_evidence(epochs["evidence"]),
+        evidence=_evidence(epochs.judgements.kind),
     )
 
 
-def _distance_m(given: JudgeInput, epochs: pl.DataFrame) -> float | None:
+def _distance_m(given: JudgeInput, epochs: JudgedEpochs) -> float | None:
     """Way driven: by the odometer, else by the reference, else by the positions; None where none of them shows it."""
     if given.odometry is not None:
-        begin_m, end_m = given.odometry.travelled_at(times_ns(epochs, "at")[[0, -1]]).tolist()
+        begin_m, end_m = given.odometry.travelled_at(epochs.at_ns[[0, -1]]).tolist()
         return float(end_m - begin_m) * (given.odometry.scale or 1.0)
-    train = epochs["train_m"].drop_nulls()
-    place = train if train.len() > 1 else epochs["path_m"].drop_nulls()
-    return float(place.diff().abs().sum()) if place.len() > 1 else None
+    train_m = epochs.train_m[np.isfinite(epochs.train_m)]
+    place_m = train_m if train_m.size > 1 else epochs.path_m[epochs.positioned]
+    return float(pl.Series(place_m).diff().abs().sum()) if place_m.size > 1 else None
 
 
-def _evidence(kinds: pl.Series) -> Evidence | None:
+def _evidence(kinds: Ints) -> Evidence | None:
     """What most epochs rest on; of equally many the first in the order of the enum."""
-    counts = {kind: (kinds == kind.value).sum() for kind in Evidence}
-    most = max(counts, key=lambda kind: counts[kind])
-    return most if counts[most] else None
+    counts = np.bincount(kinds[kinds != NOTHING], minlength=len(KINDS))
+    return KINDS[int(counts.argmax())] if counts.any() else None

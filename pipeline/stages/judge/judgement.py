@@ -2,55 +2,50 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from functools import cached_property
+from typing import Self
 
 import numpy as np
 import polars as pl
 
+from pipeline.stages.epochs.monitored import MonitoredEpochs
 from pipeline.stages.evidence import TrainEvidence, either
 from pipeline.stages.evidence.carrying import Interval, carried_forward
-from pipeline.stages.evidence.evidence import KINDS, NOTHING, Alternative, EvidenceSet, within_spans
+from pipeline.stages.evidence.evidence import NOTHING, Alternative, EvidenceSet, within_spans
+from pipeline.stages.judge.judged import ODOMETER, RIGHT, UNKNOWN, WRONG, Judgements
 from pipeline.stages.odometry import Odometry
 from pipeline.stages.track.path import RoutePath, TravelledPath
-from schemas.arrays import NS_PER_S, Bools, Floats, Ints, flags, floats, ints, times_ns
+from schemas.arrays import NS_PER_S, Bools, Floats, Ints
 from schemas.config import Configuration, HazardConfig, Vehicle
-from schemas.enums import BaliseKind, Evidence, Judgement, PassageStatus
 from schemas.frozen import frozen
+from schemas.stages import AlignedEpochs, Crossings
 
 
 @frozen
 class Solution:
-    """One solution: `fixes` as recorded, `epochs` with all columns up to the LDS, `balises` on its path."""
+    """One solution: `fixes` as recorded, its epochs up to the LDS, what the LDS passed, `balises` on its path."""
 
     name: str
     fixes: pl.DataFrame
-    epochs: pl.DataFrame
-    crossings: pl.DataFrame
+    epochs: MonitoredEpochs
+    crossings: Crossings
     passages: pl.DataFrame
     balises: pl.DataFrame
     path: TravelledPath
 
     @cached_property
-    def offers(self) -> pl.DataFrame:
-        """Crossings and telegrams, with `virtual` and `accepted`; also crossings before the balise was re-armed."""
-        virtual = pl.col("kind").cast(pl.String) == BaliseKind.VIRTUAL.value
-        accepted = virtual & (pl.col("status").cast(pl.String) == PassageStatus.ACCEPTED.value)
-        crossings = self.crossings.filter(pl.col("offered") | pl.col("status").is_null())
-        return crossings.with_columns(virtual=virtual, accepted=accepted.fill_null(value=False))
-
-    @cached_property
-    def accepted(self) -> pl.DataFrame:
-        """The virtual balises that the LDS accepted, in order of time."""
-        return self.offers.filter("accepted").sort("t")
+    def offers(self) -> Ints:
+        """Numbers of the crossings that are judged: those offered, and those before the balise was re-armed."""
+        return np.flatnonzero(self.crossings.offered | (self.crossings.status < 0))
 
 
 @frozen
 class JudgeInput:
     """One solution with the evidence of its run; `odometry` grows with its path, `faults` were injected.
 
-    `leaps_s`: whole leap seconds that may have to be added to the stamps of the positions, beside none; nobody knows.
+    `leaps_s`: whole leap seconds that may have to be added to the stamps of the positions, or none; nobody knows.
     """
 
     solution: Solution
@@ -71,30 +66,19 @@ class JudgeInput:
         return [at_ns, *(at_ns + leap_s * NS_PER_S for leap_s in self.leaps_s)]
 
     def instants(self, t_ns: Ints) -> Ints:
-        """When positions of these stamps were true: less the latency of the vehicle file, 0 without one."""
-        return t_ns - round((self.vehicle.gnss_latency_s or 0.0) * NS_PER_S)
+        """When positions of these stamps were true."""
+        return valid_at_ns(t_ns, self.vehicle)
 
     def instants_of_epochs(self) -> Ints:
-        return self.instants(times_ns(self.solution.epochs))
+        return self.instants(self.solution.epochs.t_ns)
 
     def legs(self) -> list[RoutePath]:
         return self.solution.path.routes(self.evidence.network.track.index)
 
-    def element_numbers(self, names: pl.Series) -> Ints:
-        """Net elements by their numbers in the survey, -1 for none."""
-        index = self.evidence.network.track.index
-        # A train is on a net element for many epochs: each name is looked up once for all of them.
-        visit = names.rle_id().to_numpy()
-        first = names[np.flatnonzero(np.diff(visit, prepend=-1))]
-        numbers = np.array([-1 if name is None else index.get(name, -1) for name in first], dtype=np.int64)
-        return np.asarray(numbers[visit])
 
-
-JUDGEMENTS = tuple(Judgement)
-_JUDGEMENT_WORDS = pl.Series("judgement", [word.value for word in Judgement], dtype=pl.Enum(Judgement))
-_EVIDENCE_WORDS = pl.Series("evidence", [*(kind.value for kind in KINDS), None], dtype=pl.Enum(Evidence))
-RIGHT, WRONG, UNKNOWN = (JUDGEMENTS.index(word) for word in (Judgement.RIGHT, Judgement.WRONG, Judgement.UNKNOWN))
-REFERENCE, BALISE, ODOMETER = (KINDS.index(kind) for kind in (Evidence.REFERENCE, Evidence.BALISE, Evidence.ODOMETER))
+def valid_at_ns(t_ns: Ints, vehicle: Vehicle) -> Ints:
+    """When positions of these stamps were true [ns]: less the latency of the vehicle file, 0 without one."""
+    return t_ns - round((vehicle.gnss_latency_s or 0.0) * NS_PER_S)
 
 
 @frozen
@@ -111,93 +95,21 @@ class MatchedPositions:
     unambiguous: Bools
 
     @classmethod
-    def of(cls, given: JudgeInput, frame: pl.DataFrame, unambiguous: Bools) -> MatchedPositions:
-        path_m = floats(frame, "path_m")
-        element = np.where(np.isfinite(path_m), given.element_numbers(frame["netelement_id"]), -1)
-        return cls(element, floats(frame, "measure_m"), ints(frame["leg"]), path_m, unambiguous)
+    def of(cls, epochs: AlignedEpochs, index: Mapping[str, int]) -> MatchedPositions:
+        """The positions of epochs; `index`: numbers of net elements by name."""
+        element = np.where(epochs.positioned, epochs.element_by(index), -1)
+        return cls(element, epochs.measure_m, epochs.leg, epochs.path_m, epochs.unambiguous)
+
+    @classmethod
+    def of_balises(cls, crossings: Crossings, rows: Ints, index: Mapping[str, int], unambiguous: Bools) -> Self:
+        """The places of the balises of some crossings; `index`: numbers of net elements by name."""
+        element = np.array([index.get(crossings.netelement_id[row], -1) for row in rows.tolist()], dtype=np.int64)
+        leg, path_m = crossings.leg[rows], crossings.path_m[rows]
+        return cls(element, crossings.measure_m[rows], leg, path_m, unambiguous)
 
     @property
     def known(self) -> Bools:
         return np.isfinite(self.path_m) & np.greater_equal(self.element, 0)
-
-
-@frozen
-class Judgements:
-    """Per instant: judgement (number in `JUDGEMENTS`), interval of the error along the track [m], kind of evidence.
-
-    Errors are along growing path until `turned`. `wrong_track`: wrong for its net element, wherever along it.
-    `track_assumed`: right if the survey holds the train's track, which nothing shows.
-    """
-
-    code: Ints
-    low_m: Floats
-    high_m: Floats
-    kind: Ints
-    wrong_track: Bools
-    track_assumed: Bools
-
-    @classmethod
-    def of(cls, frame: pl.DataFrame) -> Judgements:
-        """From a frame with the columns of `columns`."""
-        return cls(
-            code=ints(frame["judgement"].to_physical()),
-            low_m=floats(frame, "error_low_m"),
-            high_m=floats(frame, "error_high_m"),
-            kind=ints(frame["evidence"].to_physical(), NOTHING),
-            wrong_track=flags(frame, "wrong_track"),
-            track_assumed=flags(frame, "track_assumed"),
-        )
-
-    def columns(self) -> list[pl.Series]:
-        return [
-            _JUDGEMENT_WORDS[self.code.astype(np.uint32)],
-            pl.Series("error_low_m", self.low_m, nan_to_null=True),
-            pl.Series("error_high_m", self.high_m, nan_to_null=True),
-            _EVIDENCE_WORDS[np.where(self.kind == NOTHING, len(KINDS), self.kind).astype(np.uint32)],
-            pl.Series("wrong_track", self.wrong_track),
-            pl.Series("track_assumed", self.track_assumed),
-        ]
-
-    def turned(self, direction: Ints) -> Judgements:
-        """With the errors in the direction of travel: +1 along growing path, -1 against it."""
-        forward = direction > 0
-        low_m = np.where(forward, self.low_m, -self.high_m)
-        return replace(self, low_m=low_m, high_m=np.where(forward, self.high_m, -self.low_m))
-
-    @cached_property
-    def is_right(self) -> Bools:
-        return np.isin(self.code, RIGHT)
-
-    @cached_property
-    def is_wrong(self) -> Bools:
-        return np.isin(self.code, WRONG)
-
-    @cached_property
-    def by_truth(self) -> Bools:
-        """By reference or balise reads, which alone can call a position right."""
-        return np.isin(self.kind, [REFERENCE, BALISE])
-
-    @cached_property
-    def middle_m(self) -> Floats:
-        return 0.5 * (self.low_m + self.high_m)
-
-    @cached_property
-    def half_m(self) -> Floats:
-        return 0.5 * (self.high_m - self.low_m)
-
-    @cached_property
-    def least_m(self) -> Floats:
-        """The smallest size that the error may have."""
-        return np.asarray(np.maximum(np.maximum(self.low_m, -self.high_m), 0.0))
-
-    @cached_property
-    def largest_m(self) -> Floats:
-        """The largest size that the error may have."""
-        return np.asarray(np.maximum(-self.low_m, self.high_m))
-
-    def known_m(self, known_to_m: float) -> Floats:
-        """The error where reference or balise reads give it to plus or minus so much, else NaN [m]."""
-        return np.where(self.by_truth & (self.half_m <= known_to_m), self.middle_m, np.nan)
 
 
 def margins_m(sigma_m: Floats, config: HazardConfig) -> Floats:
@@ -211,12 +123,12 @@ def judgements_of(given: JudgeInput, positions: MatchedPositions, at_ns: Ints, e
     judged = judge_positions(positions, evidence, given.legs(), given.config.hazards)
     if given.odometry is None:
         return judged
-    accepted = given.solution.accepted
-    accepted_ns = given.instants(times_ns(accepted))
-    stood = given.evidence.stood
-    place_m = floats(accepted, "path_m")
+    crossings = given.solution.crossings
+    accepted_ns = given.instants(crossings.t_ns[crossings.accepted])
+    standstills = given.evidence.standstills
+    place_m = crossings.path_m[crossings.accepted]
     own = [
-        carried_forward(anchor_ns, place_m, clock_ns, given.odometry, stood, given.config)
+        carried_forward(anchor_ns, place_m, clock_ns, given.odometry, standstills, given.config)
         for anchor_ns, clock_ns in zip(given.clocks_ns(accepted_ns), given.clocks_ns(at_ns), strict=True)
     ]
     # NaN, where one of the clocks leaves nothing known.
@@ -232,8 +144,20 @@ def judge_positions(
 ) -> Judgements:
     """Wrong where it is too far ahead, or too far behind, for every alternative; right where it is right for all.
 
-    `legs`: of the path, coordinate `path_m`. The interval of the error spans the alternatives whose track joins the
-    position's, as only there a distance along the track exists.
+    The interval of the error spans the alternatives whose track joins the position's, as only there a distance along
+    the track exists.
+
+    Args:
+        positions: n positions on the network.
+        evidence: where the train was at the same n instants.
+        legs: the legs of the solution's path; their coordinate is `path_m`.
+        config: limits of an error [m].
+
+    Returns:
+        n judgements; errors along growing path.
+
+    Source:
+        DOMAIN section 5.2.
     """
     size = positions.element.size
     limit_m = config.limits.failure_m
@@ -339,11 +263,10 @@ def with_own_anchors(
     high_m = positions.path_m - train_m[0]
     limit_m = config.limits.failure_m
     beyond = rows & ((low_m > limit_m) | (high_m < -limit_m))
-    return Judgements(
+    return replace(
+        judged,
         code=np.where(beyond, WRONG, judged.code),
         low_m=np.where(rows, low_m, judged.low_m),
         high_m=np.where(rows, high_m, judged.high_m),
         kind=np.where(rows, ODOMETER, judged.kind),
-        wrong_track=judged.wrong_track,
-        track_assumed=judged.track_assumed,
     )

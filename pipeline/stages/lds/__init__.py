@@ -15,7 +15,7 @@ Where the sources leave a choice:
   keeps its first linking error. What is passed but not accepted is `missed` by linking, whatever its `status`.
 - Virtual and physical balises are two chains that share nothing but the re-link anchor.
 - Linking holds in both directions of travel. Balises in whose window the train turned round may be found or not; the
-  5 % of the odometer then count on the whole way run since the reference.
+  5 % of the odometer then count on the whole distance run since the reference.
 - Not announced (`linked` false): rejected while linking is in force, taken like any other before that.
 - With `entry_from_unfitted_area` the first virtual balise too needs the diagnosis behind it (`init_s`).
 - The linking distance monitor allows 5 m + 5 % and the noise of both positions at k_T: 5 m alone would alarm on sound

@@ -16,7 +16,6 @@ from pipeline.stages.odometry.bound import is_lost
 from pipeline.stages.odometry.driven import turns_of
 from schemas.arrays import NS_PER_S, Bools, Floats, Ints, spans_of
 from schemas.config import Configuration, LdsConfig
-from schemas.conform import dtypes, table_of_rows
 from schemas.enums import BaliseKind, LinkingError, PassageStatus, Reaction
 from schemas.stages import AlignedEpochs, Crossings
 
@@ -179,7 +178,7 @@ def window_m(distance_m: float, accuracy_m: float, reference_accuracy_m: float, 
 
 
 def window_after_turn_m(distance_m: float, travelled_m: float, margin_m: float, config: LdsConfig = DEFAULTS) -> Window:
-    """Where the train turned round since the reference: 5 % of the whole way run, not of the net distance.
+    """Where the train turned round since the reference: 5 % of the whole distance run, not of the net distance.
 
     `margin_m` is Q + Q_r + 5 m. The clauses know no such case.
     """
@@ -225,8 +224,8 @@ class Crossing:
     """The position passes a virtual balise, or the reader reads a physical one.
 
     `before`, `epoch`: rows of the epochs around it. `sense`: of the position's step, +1 along growing path;
-    `direction`: of travel as known at `epoch`. Time, odometer and way are interpolated; after a gap they are those of
-    `epoch`, and `absence` says what a balise passed in it is.
+    `direction`: of travel as known at `epoch`. Time, odometer and distance are interpolated; after a gap they are those
+    of `epoch`, and `absence` says what a balise passed in it is.
     """
 
     balise: Balise
@@ -271,6 +270,46 @@ class Passage:
         if self.linking_error is LinkingError.NONE:
             self.linking_error = error
         self.reaction = max(self.reaction, reaction, key=_SEVERITY.index)
+
+
+class Disarmed:
+    """Balises just detected, re-armed max(`rearm_m`, `rearm_sigmas`) away (DOMAIN section 4).
+
+    By the odometer; without one by the position's distance from the balise.
+    """
+
+    def __init__(self, journey: Journey, config: LdsConfig) -> None:
+        self._journey = journey
+        self._config = config
+        self._at: dict[str, tuple[Balise, float]] = {}
+
+    def __bool__(self) -> bool:
+        return bool(self._at)
+
+    def holds(self, balise: Balise) -> bool:
+        return balise.balise_id in self._at
+
+    def add(self, crossing: Crossing) -> None:
+        odometer_m = float("nan") if crossing.odometer_m is None else crossing.odometer_m
+        self._at[crossing.balise.balise_id] = (crossing.balise, odometer_m)
+
+    def rearm(self, begin: int, end: int) -> None:
+        """Those that are far enough away at one of the epochs from `begin` on, before `end`."""
+        part = slice(begin, end)
+        away_m = np.fmax(self._config.rearm_m, self._config.rearm_sigmas * self._journey.sigma_m[part])
+        for name, (balise, at_m) in list(self._at.items()):
+            if (np.abs(self._moved_m(part, balise, at_m)) >= away_m).any():
+                del self._at[name]
+
+    def _moved_m(self, part: slice, balise: Balise, at_m: float) -> Floats:
+        if not self._journey.has_odometer:
+            return self._journey.path_m[part] - balise.path_m
+        odometer_m = self._journey.odometer_m[part]
+        if isnan(at_m):
+            known = odometer_m[np.isfinite(odometer_m)]
+            at_m = float(known[0]) if known.size else at_m
+            self._at[balise.balise_id] = (balise, at_m)
+        return odometer_m - at_m
 
 
 def balises_of(frame: pl.DataFrame, kind: BaliseKind) -> list[Balise]:
@@ -327,21 +366,28 @@ def in_order_of_time(crossings: Sequence[Crossing]) -> list[Crossing]:
     return sorted(crossings, key=lambda crossing: (crossing.t_ns, crossing.epoch, crossing.balise.kind.value))
 
 
-def crossing_rows(crossings: Sequence[Crossing]) -> pl.DataFrame:
-    rows = [_row(number, crossing) for number, crossing in enumerate(crossings)]
-    return table_of_rows(rows, dtypes(Crossings))
+def arrays_of_crossings(crossings: Sequence[Crossing]) -> Crossings:
+    """What the LDS passed, for later stages."""
+    balises = [crossing.balise for crossing in crossings]
+    return Crossings(
+        balise_id=[balise.balise_id for balise in balises],
+        netelement_id=[balise.netelement_id for balise in balises],
+        measure_m=np.array([balise.measure_m for balise in balises], dtype=np.float64),
+        leg=np.array([balise.leg for balise in balises], dtype=np.int64),
+        path_m=np.array([balise.path_m for balise in balises], dtype=np.float64),
+        virtual=np.array([balise.kind is BaliseKind.VIRTUAL for balise in balises], dtype=np.bool_),
+        before=np.array([crossing.before for crossing in crossings], dtype=np.int64),
+        epoch=np.array([crossing.epoch for crossing in crossings], dtype=np.int64),
+        t_ns=np.array([crossing.t_ns for crossing in crossings], dtype=np.int64),
+        sense=np.array([crossing.sense for crossing in crossings], dtype=np.int64),
+        direction=np.array([crossing.direction for crossing in crossings], dtype=np.int64),
+        odometer_m=np.array([crossing.odometer_m for crossing in crossings], dtype=np.float64),
+        offered=np.array([crossing.offered for crossing in crossings], dtype=np.bool_),
+        status=np.array([_STATUS.get(crossing.status, -1) for crossing in crossings], dtype=np.int64),
+    )
 
 
-def _row(number: int, crossing: Crossing) -> dict[str, object]:
-    offer = ("before", "epoch", "sense", "direction", "odometer_m", "offered")
-    return {
-        "crossing_id": number,
-        **{name: getattr(crossing, name) for name in offer},
-        **{name: getattr(crossing.balise, name) for name in ("leg", *PLACE)},
-        "kind": crossing.balise.kind.value,
-        "t": crossing.t_ns,
-        "status": crossing.status and crossing.status.value,
-    }
+_STATUS: dict[PassageStatus | None, int] = {status: number for number, status in enumerate(PassageStatus)}
 
 
 def reads_of(

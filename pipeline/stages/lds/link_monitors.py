@@ -85,7 +85,7 @@ class Held(NamedTuple):
 
 
 class Relink:
-    """The one way back: what the position is compared with, and how. `tvb`: flags of the epochs so far.
+    """The return into use: what the position is compared with, and how. `tvb`: flags of the epochs so far.
 
     The anchor is fixed where the position is withheld. After an alarm, or slip that the odometer reports, it is the
     last telegram, else the first TVB of the mission: a slow drift has moved every later one. After time that nothing
@@ -168,9 +168,11 @@ class Relink:
         at = slice(epoch, end)
         moved_m = journey.path_m[at] - journey.odometer_m[at] - anchor.offset_m
         waited_s = (journey.t_ns[at] - anchor.t_ns) / NS_PER_S
-        way_m = journey.travelled_m[at] - anchor.travelled_m
+        driven_m = journey.travelled_m[at] - anchor.travelled_m
         positions_m2 = anchor.sigma_m**2 + journey.sigma_m[at] ** 2
-        bound_m = self._rule.bound_m(self._rule.variance_m2(positions_m2, waited_s, way_m, journey.scale_sigma or 0.0))
+        bound_m = self._rule.bound_m(
+            self._rule.variance_m2(positions_m2, waited_s, driven_m, journey.scale_sigma or 0.0)
+        )
         doubt_m = journey.doubt_m[at] - journey.doubt_m[anchor.epoch]
         known = doubt_m <= self._rule.most_m
         return np.where(known, moved_m, np.nan), np.minimum(self._rule.most_m, bound_m + doubt_m)
@@ -291,6 +293,11 @@ class LinkDistance:
         self._since_return[:, epoch:] = np.nan
         self._since_return[:, epoch : epoch + moved_m.size] = moved_m, bound_m
 
+    @property
+    def measures(self) -> bool:
+        """There is something to measure from."""
+        return self._anchor is not None
+
     def can_measure(self, epoch: int) -> bool:
         """Nothing of the odometer's distance since the anchor is in doubt."""
         doubt_m = self._journey.doubt_m
@@ -330,10 +337,10 @@ class LinkDistance:
 
     def _evaluate(self, anchor: Anchor, ahead: slice) -> None:
         """Elementwise, so every epoch still knows only its own past."""
-        way_m = np.abs(self._journey.travelled_m[ahead] - anchor.travelled_m)
+        driven_m = np.abs(self._journey.travelled_m[ahead] - anchor.travelled_m)
         rows_m2 = self._journey.rows_m[ahead] ** 2 + self._journey.rows_m[anchor.epoch] ** 2
         noise_m = self._factor * np.sqrt(self._journey.sigma_m[ahead] ** 2 + anchor.sigma_m**2 + rows_m2)
-        threshold_m = self._config.odometer_fixed_m + self._config.odometer_share * way_m + noise_m
+        threshold_m = self._config.odometer_fixed_m + self._config.odometer_share * driven_m + noise_m
         lost = self._possible[ahead] & (self._journey.doubt_m[ahead] != self._journey.doubt_m[anchor.epoch])
         known = self._possible[ahead] & ~lost
         moved_m, bound_m = self._since_return[:, ahead]

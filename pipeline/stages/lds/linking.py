@@ -20,7 +20,7 @@ MISSED_IN_A_ROW = 2
 
 @dataclass(frozen=True, slots=True)
 class LinkingReference:
-    """The last relevant balise: where odometer and way run stood when it was detected."""
+    """The last relevant balise: where odometer and distance run were when it was detected."""
 
     balise: Balise
     odometer_m: float | None
@@ -72,7 +72,7 @@ class LinkingChain:
         self.passages: list[Passage] = []
         self.reference: LinkingReference | None = None
         self._linked = [balise for balise in balises if balise.linked]
-        self._ways: dict[tuple[int | None, int], _Announced] = {}
+        self._announced_ahead: dict[tuple[int | None, int], _Announced] = {}
         self._config = config
         self._direction = 1
         self._leg: int | None = None
@@ -107,7 +107,7 @@ class LinkingChain:
             self._close_windows(self._distance_m(odometer_m), t_ns, absence)
 
     def turn(self, journey: Journey, epoch: int) -> None:
-        """The train goes the other way, or on another leg: expect the balises on its new way.
+        """The train goes in the other direction, or on another leg: expect the balises ahead of it now.
 
         Those whose window covers the place of the turn may have been passed or not: they are optional. (Without this 9
         of 10 healthy trains that turn 2 to 24 m before or 15 m behind a balise miss it, and brake.)
@@ -171,8 +171,8 @@ class LinkingChain:
             return
         distance_m = self._distance_m(odometer_m)
         for balise in self._ahead.balises[self._next :]:
-            unseen = balise.balise_id not in self._own and balise.balise_id not in self._optional
-            if unseen and self._announced_m(balise) < distance_m:
+            not_offered = balise.balise_id not in self._own and balise.balise_id not in self._optional
+            if not_offered and self._announced_m(balise) < distance_m:
                 passage = self._new_passage(balise, t_ns, self._direction)
                 passage.status = absence
 
@@ -250,16 +250,16 @@ class LinkingChain:
         self._missed_in_a_row = 0
         self._optional = set()
         self._own.pop(balise.balise_id, None)
-        way = self._in_order_of_travel() if self.linking else _Announced([], 1)
-        self._expect(way, way.first_beyond(balise.path_m))
+        announced = self._in_order_of_travel() if self.linking else _Announced([], 1)
+        self._expect(announced, announced.first_beyond(balise.path_m))
 
     def _in_order_of_travel(self) -> _Announced:
         leg = self._leg
         direction = self._direction
-        if (leg, direction) not in self._ways:
+        if (leg, direction) not in self._announced_ahead:
             valid = [balise for balise in self._linked if balise.leg == leg and balise.is_valid(direction)]
-            self._ways[leg, direction] = _Announced(valid[::direction], direction)
-        return self._ways[leg, direction]
+            self._announced_ahead[leg, direction] = _Announced(valid[::direction], direction)
+        return self._announced_ahead[leg, direction]
 
     def _expect(self, announced: _Announced, first: int) -> None:
         self._ahead = announced

@@ -5,13 +5,11 @@ from __future__ import annotations
 from bisect import bisect_left
 from collections.abc import Sequence
 from enum import Enum, auto
-from math import isnan
-
-import numpy as np
 
 from pipeline.stages.lds.crossings import (
     Balise,
     Crossing,
+    Disarmed,
     Journey,
     mission_epochs,
     odometer_epochs,
@@ -21,8 +19,8 @@ from pipeline.stages.lds.crossings import (
 from pipeline.stages.lds.link_monitors import Anchor, Held, LinkDistance, LinkOrder, Recovery, Relink, disorder
 from pipeline.stages.lds.linking import LinkingChain, LrvbChange
 from pipeline.stages.monitors.bank import MonitorBank
-from schemas.arrays import NS_PER_S, Floats
-from schemas.config import Configuration, LdsConfig
+from schemas.arrays import NS_PER_S
+from schemas.config import Configuration
 from schemas.enums import BaliseKind, LostTo, PassageStatus
 
 
@@ -134,46 +132,6 @@ class BaliseDetection:
         return out_of_order > 0
 
 
-class Disarmed:
-    """Balises just detected, re-armed max(`rearm_m`, `rearm_sigmas`) away (DOMAIN section 4).
-
-    By the odometer; without one by the position's distance from the balise.
-    """
-
-    def __init__(self, journey: Journey, config: LdsConfig) -> None:
-        self._journey = journey
-        self._config = config
-        self._at: dict[str, tuple[Balise, float]] = {}
-
-    def __bool__(self) -> bool:
-        return bool(self._at)
-
-    def holds(self, balise: Balise) -> bool:
-        return balise.balise_id in self._at
-
-    def add(self, crossing: Crossing) -> None:
-        odometer_m = float("nan") if crossing.odometer_m is None else crossing.odometer_m
-        self._at[crossing.balise.balise_id] = (crossing.balise, odometer_m)
-
-    def rearm(self, begin: int, end: int) -> None:
-        """Those that are far enough away at one of the epochs from `begin` on, before `end`."""
-        part = slice(begin, end)
-        away_m = np.fmax(self._config.rearm_m, self._config.rearm_sigmas * self._journey.sigma_m[part])
-        for name, (balise, at_m) in list(self._at.items()):
-            if (np.abs(self._moved_m(part, balise, at_m)) >= away_m).any():
-                del self._at[name]
-
-    def _moved_m(self, part: slice, balise: Balise, at_m: float) -> Floats:
-        if not self._journey.has_odometer:
-            return self._journey.path_m[part] - balise.path_m
-        odometer_m = self._journey.odometer_m[part]
-        if isnan(at_m):
-            known = odometer_m[np.isfinite(odometer_m)]
-            at_m = float(known[0]) if known.size else at_m
-            self._at[balise.balise_id] = (balise, at_m)
-        return odometer_m - at_m
-
-
 class Use(Enum):
     """Whether the train uses the position (DOMAIN section 4).
 
@@ -239,9 +197,10 @@ class LocationSystem:
     def run(self) -> None:
         epoch = 0
         while epoch < len(self._t_ns):
-            end = self._uneventful_until(epoch)
-            if end > epoch:
+            if (end := self._uneventful_until(epoch)) > epoch:
                 self._pass_uneventful(epoch, end)
+            elif (end := self._hidden_until(epoch)) > epoch:
+                self._pass_hidden(epoch, end)
             else:
                 self._step(epoch)
             epoch = max(end, epoch + 1)
@@ -259,10 +218,17 @@ class LocationSystem:
             return epoch
         if self._journey.has_odometer and not self.distance.can_measure(epoch):
             return epoch
-        near = bisect_left(self._events, epoch)
-        end = self._events[near] if near < len(self._events) else len(self._t_ns)
+        end = self._next_event(epoch)
         for monitors in (self._bank, self.distance):
             end = monitors.quiet_until(epoch, end) if end > epoch else epoch
+        return self._first_closing(epoch, end)
+
+    def _next_event(self, epoch: int) -> int:
+        near = bisect_left(self._events, epoch)
+        return self._events[near] if near < len(self._events) else len(self._t_ns)
+
+    def _first_closing(self, epoch: int, end: int) -> int:
+        """The first epoch before `end` at which the window of a balise closes."""
         closing = self._way_m[epoch:end] > self.balises.closing_m
         return epoch + int(closing.argmax()) if closing.any() else end
 
@@ -271,6 +237,20 @@ class LocationSystem:
         self.evaluated[epoch:end] = evaluated.tolist()
         self.tvb[epoch:end] = (evaluated & self._journey.usable[epoch:end]).tolist()
         self._validated = True
+        self.balises.rearm(epoch, end)
+
+    def _hidden_until(self, epoch: int) -> int:
+        """The first epoch from here on for `_step`; before it the noise is unknown, and nothing was validated yet."""
+        if self._use is not Use.IN_USE or self._validated or self.distance.measures:
+            return epoch
+        end = self._next_event(epoch)
+        return self._first_closing(epoch, self._bank.hidden_until(epoch, end)) if end > epoch else epoch
+
+    def _pass_hidden(self, epoch: int, end: int) -> None:
+        self.withheld_for[epoch:end] = [LostTo.NOISE] * (end - epoch)
+        self._hidden_ns = self._t_ns[epoch] if self._hidden_ns is None else self._hidden_ns
+        if self._journey.slips[epoch:end].any():
+            self._consistent_since_ns = None
         self.balises.rearm(epoch, end)
 
     def _step(self, epoch: int) -> None:

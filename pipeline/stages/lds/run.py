@@ -14,8 +14,8 @@ from pipeline.stages.lds.crossings import (
     Crossing,
     Journey,
     Passage,
+    arrays_of_crossings,
     balises_of,
-    crossing_rows,
     find_crossings,
     in_order_of_time,
     reads_of,
@@ -24,27 +24,27 @@ from pipeline.stages.lds.link_monitors import Held
 from pipeline.stages.lds.linking import LrvbChange
 from pipeline.stages.lds.machine import LocationSystem
 from pipeline.stages.monitors.bank import MonitorBank
-from schemas.arrays import Bools, Floats
+from schemas.arrays import Bools, Floats, Ints
 from schemas.config import Configuration, LdsConfig
 from schemas.conform import dtypes
-from schemas.enums import BaliseKind, Cause, Direction, FailureMode, LdsMode
+from schemas.enums import BaliseKind, Cause, Direction, FailureMode, LdsMode, LostTo
 from schemas.frozen import frozen
-from schemas.stages import AlignedEpochs
-from schemas.tables import Epochs, Passages
+from schemas.stages import AlignedEpochs, Crossings, LdsEpochs
+from schemas.tables import Passages
 
 
 @frozen
 class LdsResult:
     """What the LDS made of one solution.
 
-    `epochs`: `t` and the LDS columns. `linking`: verdicts of the linking monitors by name. `passages`: as in the
+    `linking`: verdicts of the linking monitors by name. `passages`: as in the
     contract, what needs a truth null or `none`, and `t_reckoned`: when LRVB and odometer say that the train passes a
     balise that was not offered. `unknown_reads`: of balises not on the path. `held`: re-links that held.
     """
 
-    epochs: pl.DataFrame
+    epochs: LdsEpochs
     linking: Mapping[str, Verdicts]
-    crossings: pl.DataFrame
+    crossings: Crossings
     passages: pl.DataFrame
     unknown_reads: pl.DataFrame
     held: tuple[Held, ...]
@@ -59,11 +59,22 @@ def run_lds(
     config: Configuration,
     solution: str = "primary",
 ) -> LdsResult:
-    """Detect virtual balises, keep the TVB chain, negate and return (DOMAIN section 4).
+    """Detect virtual balises, keep the TVB chain, negate and return.
 
-    `balises`: of the travelled path. `balise_reads`: `t, balise_id`, and
-    `odometer_m`; without that stream physical balises have no passages. `scale_sigma`: of the odometer by a vehicle
-    file, else None.
+    Args:
+        epochs: aligned epochs of the solution, in order of time.
+        bank: its monitors; the LDS freezes and restarts it.
+        balises: those of the travelled path, by leg, with path position, accuracy and linking.
+        balise_reads: telegrams (`t`, `balise_id`, `odometer_m` [m]); None: physical balises have no passages.
+        scale_sigma: deviation of the odometer's scale by a vehicle file [1], else None.
+        config: the configuration; used are `lds`, `align` and `monitors`.
+        solution: its name, as it stands in the passages.
+
+    Returns:
+        What the LDS says of each epoch, crossing and passage; at an epoch it knows nothing of later ones.
+
+    Source:
+        DOMAIN section 4; SUBSET-026 3.4.4 and 3.6.4; TVB section 3.
     """
     journey = Journey(epochs, scale_sigma, config)
     on_path = {kind: balises_of(balises, kind) for kind in BaliseKind}
@@ -73,38 +84,42 @@ def run_lds(
     system.run()
     passages = system.balises.virtual.passages + system.balises.physical.passages
     return LdsResult(
-        epochs=epoch_columns(epochs.table["t"], system, journey, config.lds),
+        epochs=_epochs(system, journey, config.lds),
         linking={"link_order": system.balises.order.verdicts(), "link_distance": system.distance.verdicts()},
-        crossings=crossing_rows(crossings),
+        crossings=arrays_of_crossings(crossings),
         passages=passage_rows(passages, crossings, journey, solution),
         unknown_reads=unknown,
         held=tuple(system.held),
     )
 
 
-def epoch_columns(t: pl.Series, system: LocationSystem, journey: Journey, config: LdsConfig) -> pl.DataFrame:
-    names = [change.lrvb and change.lrvb.balise.balise_id for change in system.lrvb_changes]
-    starts = np.array([change.epoch for change in system.lrvb_changes])
+def _epochs(system: LocationSystem, journey: Journey, config: LdsConfig) -> LdsEpochs:
+    changes = system.lrvb_changes
+    starts = np.array([change.epoch for change in changes])
     index = np.searchsorted(starts, np.arange(journey.t_ns.size), side="right") - 1
-    distance_m, doubt_m = _reported_m(system.lrvb_changes, index, journey, config)
-    withheld_for = pl.Series("withheld_for", system.withheld_for, dtype=dtypes(Epochs)["withheld_for"])
-    withheld = withheld_for.is_not_null().alias("withheld")
-    columns = [
-        t,
-        _modes(system, index, journey, withheld.to_numpy()),
-        pl.Series("tvb", system.tvb, dtype=pl.Boolean),
-        pl.Series("lrvb_id", names, dtype=pl.String).gather(index),
-        pl.Series("distance_from_lrvb_m", distance_m, nan_to_null=True),
-        pl.Series("doubt_over_m", doubt_m, nan_to_null=True),
-        pl.Series("doubt_under_m", doubt_m, nan_to_null=True),
-        pl.Series("exposure_s", _exposure_s(system, journey), nan_to_null=True),
-        pl.Series("negated", system.negated, dtype=pl.Boolean),
-        withheld,
-        withheld_for,
-        pl.Series("diagnosis_faulty", _diagnosis_faulty(system, journey, withheld.to_numpy())),
-        pl.Series("alarm", system.alarm, dtype=pl.Boolean),
-    ]
-    return pl.DataFrame(columns)
+    names = [None if change.lrvb is None else change.lrvb.balise.balise_id for change in changes]
+    numbers = {name: number for number, name in enumerate(dict.fromkeys(name for name in names if name is not None))}
+    distance_m, doubt_m = _reported_m(changes, index, journey, config)
+    withheld_for = np.array([_LOST_TO.get(cause, -1) for cause in system.withheld_for], dtype=np.int64)
+    withheld = withheld_for >= 0
+    return LdsEpochs(
+        lds_mode=_modes(system, index, journey, withheld),
+        tvb=np.array(system.tvb, dtype=np.bool_),
+        lrvb=np.array([-1 if name is None else numbers[name] for name in names], dtype=np.int64)[index],
+        lrvb_ids=list(numbers),
+        distance_from_lrvb_m=distance_m,
+        # The allowance of 5 m + 5 % is the same to both sides.
+        doubt_over_m=doubt_m,
+        doubt_under_m=doubt_m,
+        exposure_s=_exposure_s(system, journey),
+        negated=np.array(system.negated, dtype=np.bool_),
+        withheld_for=withheld_for,
+        diagnosis_faulty=_diagnosis_faulty(system, journey, withheld),
+        alarm=np.array(system.alarm, dtype=np.bool_),
+    )
+
+
+_LOST_TO: dict[LostTo | None, int] = {cause: number for number, cause in enumerate(LostTo)}
 
 
 def _diagnosis_faulty(system: LocationSystem, journey: Journey, withheld: Bools) -> Bools:
@@ -114,8 +129,8 @@ def _diagnosis_faulty(system: LocationSystem, journey: Journey, withheld: Bools)
     return faulty
 
 
-def _modes(system: LocationSystem, index: np.ndarray, journey: Journey, withheld: Bools) -> pl.Series:
-    """`index`: the change of LRVB in force at each epoch."""
+def _modes(system: LocationSystem, index: Ints, journey: Journey, withheld: Bools) -> Ints:
+    """By number in `LdsMode`; `index`: the change of LRVB in force at each epoch."""
     linked = np.array(
         [
             (change.lrvb is not None and change.lrvb.odometer_m is not None)
@@ -123,16 +138,13 @@ def _modes(system: LocationSystem, index: np.ndarray, journey: Journey, withheld
             for change in system.lrvb_changes
         ]
     )[index]
-    modes = [mode.value for mode in LdsMode]
+    modes = list(LdsMode)
     in_use = np.where(journey.usable & ~withheld, modes.index(LdsMode.LINKED), modes.index(LdsMode.ODOMETRY))
     mode = np.where(linked, in_use, modes.index(LdsMode.INITIALISING))
-    mode = np.where(system.negated, modes.index(LdsMode.FAIL_SAFE), mode)
-    return pl.Series("lds_mode", modes, dtype=dtypes(Epochs)["lds_mode"]).gather(mode)
+    return np.where(system.negated, modes.index(LdsMode.FAIL_SAFE), mode)
 
 
-def _reported_m(
-    changes: list[LrvbChange], index: np.ndarray, journey: Journey, config: LdsConfig
-) -> tuple[Floats, Floats]:
+def _reported_m(changes: list[LrvbChange], index: Ints, journey: Journey, config: LdsConfig) -> tuple[Floats, Floats]:
     """Odometer distance since the LRVB, and by how much it over- or under-reads (SUBSET-026 3.6.4)."""
     values = [
         (np.nan, np.nan, np.nan)
@@ -146,8 +158,8 @@ def _reported_m(
     ]
     odometer_m, travelled_m, accuracy_m = np.array(values)[index].T
     distance_m = np.abs(journey.odometer_m - odometer_m)
-    way_m = np.maximum(np.abs(journey.travelled_m - travelled_m), distance_m)
-    return distance_m, accuracy_m + config.odometer_fixed_m + config.odometer_share * way_m
+    driven_m = np.maximum(np.abs(journey.travelled_m - travelled_m), distance_m)
+    return distance_m, accuracy_m + config.odometer_fixed_m + config.odometer_share * driven_m
 
 
 def _exposure_s(system: LocationSystem, journey: Journey) -> Floats:

@@ -1,4 +1,4 @@
-"""Map matching: which way the train went over the network, and where each epoch is on that path.
+"""Map matching: which route the train took over the network, and where each epoch is on that path.
 
 In: fixes of one solution (or the reference), odometer, site. Out: `Match`: `schemas.stages.MatchedEpochs` and the path.
 Touches no file. The path may use the whole run; `gate_probability`, which feeds detection, only what came before.

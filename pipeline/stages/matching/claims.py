@@ -17,7 +17,7 @@ _LONGEST_M = 300.0
 
 
 def branches_beyond_m(network: Network, wanted: set[int]) -> dict[int, float]:
-    """Per oriented element the way beyond its exit to the next branch of tracks [m], infinite to an open end."""
+    """Distance from each oriented element's exit to the next branch [m], infinite to an open end."""
     beyond: dict[int, float] = {}
     for start in sorted(wanted):
         chain: list[int] = []
@@ -63,13 +63,13 @@ class OneTrack:
         self._near = self._spread(found)
 
     def behind_m(self, node: Node) -> Floats:
-        """Of the switches beyond start and end of the node's element: how far behind them the tracks are one [m]."""
+        """How far behind the switches at start and end of the node's element the tracks are one [m]."""
         zones = (self.zone(2 * node.element + 1), self.zone(2 * node.element))
         near = self._near.get(id(node), set())
         return np.array([zone.length_m if zone.leading in near else 0.0 for zone in zones])
 
     def zone(self, oriented: int) -> Zone:
-        """Of the line's end beyond the exit of an element."""
+        """The zone of the line's end beyond the exit of an element."""
         if oriented not in self._zones:
             self._zones[oriented] = self._measured(oriented)
         return self._zones[oriented]
@@ -96,6 +96,7 @@ class OneTrack:
         return near
 
     def _begun_near(self, node: Node) -> set[int]:
+        """Ends of its line near which a hypothesis begins, by the elements that lead there."""
         begun_m = node.left_m[0] if len(node.left_m) else np.zeros(2)
         near = set()
         for side in (0, 1):
@@ -107,7 +108,7 @@ class OneTrack:
         return near
 
     def _beyond_m(self, oriented: int, last: int) -> float:
-        """From the exit of an element to that of a later one on its line."""
+        """Distance from the exit of an element to that of a later one on its line [m]."""
         beyond_m = 0.0
         while oriented != last:
             oriented = self._network.successors[oriented][0].to
@@ -115,27 +116,28 @@ class OneTrack:
         return beyond_m
 
     def _measured(self, oriented: int) -> Zone:
+        """Follow a line to its first switch and measure how far behind that the branches are one track."""
         network = self._network
-        line, way_m = [oriented], 0.0
-        while way_m < _LONGEST_M and len(onward := network.successors[line[-1]]) == 1 and onward[0].to not in line:
+        line, distance_m = [oriented], 0.0
+        while distance_m < _LONGEST_M and len(onward := network.successors[line[-1]]) == 1 and onward[0].to not in line:
             back = network.successors[onward[0].to ^ 1]
             if len(back) > 1:
                 own = line[-1] ^ 1
-                ways_m = (self._together_m(own, edge.to) for edge in back if edge.to != own)
-                return Zone(line[-1], max(ways_m))
+                shared_m = (self._together_m(own, edge.to) for edge in back if edge.to != own)
+                return Zone(line[-1], max(shared_m))
             line.append(onward[0].to)
-            way_m += network.length_m(line[-1])
+            distance_m += network.length_m(line[-1])
         return Zone(line[-1], 0.0)
 
     def _together_m(self, one: int, other: int) -> float:
-        """Way from their common begin on over which two branches are nearer than `apart_m`."""
-        ways, places = zip(*(self._drawn(oriented) for oriented in (one, other)), strict=True)
-        last_m = min(float(way[-1]) for way in ways)
-        at_m = np.union1d(*ways)
+        """Distance from their common begin over which two branches are nearer than `apart_m`."""
+        distances_m, places = zip(*(self._drawn(oriented) for oriented in (one, other)), strict=True)
+        last_m = min(float(distance_m[-1]) for distance_m in distances_m)
+        at_m = np.union1d(*distances_m)
         at_m = at_m[at_m <= last_m]
         first, second = (
-            np.column_stack([np.interp(at_m, way, place[:, axis]) for axis in range(3)])
-            for way, place in zip(ways, places, strict=True)
+            np.column_stack([np.interp(at_m, distance_m, place[:, axis]) for axis in range(3)])
+            for distance_m, place in zip(distances_m, places, strict=True)
         )
         apart_m = np.linalg.norm(first - second, axis=1)
         wide = np.flatnonzero(apart_m >= self._apart_m)
@@ -147,7 +149,9 @@ class OneTrack:
         return float(np.interp(self._apart_m, apart_m[row - 1 : row + 1], at_m[row - 1 : row + 1]))
 
     def _drawn(self, oriented: int) -> tuple[Floats, Floats]:
-        """A line from an element's entry on, up to the next choice: way [m] and places of its points."""
+        """A line from an element's entry on, up to the next choice: distance from there [m] and places of its
+        points.
+        """
         network, track = self._network, self._network.track
         line = [oriented]
         length_m = network.length_m(oriented)
@@ -212,8 +216,8 @@ class Claims:
 
 
 @frozen
-class _Left:
-    """Per step what is left of a set: line (-1: none, -2: several), the two likeliest lines, way to a branch [m].
+class _LinesLeft:
+    """Per step what is left of a set: line (-1: none, -2: several), the two likeliest lines, distance to a branch [m].
 
     `line`, `element`, `p`: of the two lines with the largest p-values, shapes (n, 2), -1 and 0 without one.
     """
@@ -231,10 +235,23 @@ class _Left:
 
 
 def claims(found: PathSet, t_s: Floats, element: Ints, sigma_m: Floats, config: MatchingConfig) -> Claims:
-    """`t_s`: times of the epochs; `element`: net element of the path shown, -1 for none; `sigma_m`: along the track.
+    """The confidence that each epoch lies on the track shown, as known at the time and in hindsight.
 
     Live an epoch uses the steps that ended before it, and of their rejections those of `paths_delay_s` ago. The set is
     carried to the epoch over every relation that the train may have reached since, confidence interval included.
+
+    Args:
+        found: the paths that the positions do not reject.
+        t_s: times of the epochs since the first position [s], shape (n,).
+        element: net element of the path shown at each epoch, -1 for none, shape (n,).
+        sigma_m: standard deviation of each position along the track [m], shape (n,).
+        config: the section `matching` of the configuration.
+
+    Returns:
+        Confidences and rival elements per epoch, and the elements possible at each step.
+
+    Source:
+        DOMAIN section 2, rules 10 and 13.
     """
     steps = found.steps
     count = len(steps)
@@ -244,18 +261,18 @@ def claims(found: PathSet, t_s: Floats, element: Ints, sigma_m: Floats, config: 
         return Claims(nothing, nothing, np.full(t_s.size, -1), Possible(none, np.zeros(1, np.int64), none, np.zeros(0)))
     before = np.searchsorted(steps.end_s, t_s, side="right") - 1
     about = np.clip(np.searchsorted(steps.end_s, t_s, side="left"), 0, count - 1)
-    speed_mps = steps.way_m / np.maximum(np.diff(steps.end_s, prepend=steps.begin_s[0]), 1e-3)
+    speed_mps = steps.distance_m / np.maximum(np.diff(steps.end_s, prepend=steps.begin_s[0]), 1e-3)
     since_s = np.where(before >= 0, t_s - steps.end_s[np.maximum(before, 0)], 0.0)
     carried_m = 1.2 * speed_mps[np.maximum(before, 0)] * since_s + config.paths_along_sigmas * np.nan_to_num(sigma_m)
     group = np.where(element >= 0, found.groups[np.maximum(element, 0)], -1)
     alone = _alone(found)
-    live = _left(found, found.living(config.paths_delay_s), OneTrack(found, config.paths_one_track_m))
+    live = _lines_left(found, found.living(config.paths_delay_s), OneTrack(found, config.paths_one_track_m))
     at = np.maximum(before, 0)
     gate = _confidence(live, at, group, carried_m, alone)
     gate[before < 0] = 0.0
     gate[found.unclaimed[at]] = np.minimum(gate[found.unclaimed[at]], MOST_IN_DOUBT)
     spans = found.to_the_end()
-    left = _left(found, spans)
+    left = _lines_left(found, spans)
     later = _hindsight(left, about, group, alone)
     later[found.unclaimed[about]] = np.minimum(later[found.unclaimed[about]], MOST_IN_DOUBT)
     now, p_now = live.rival(at, group)
@@ -289,9 +306,9 @@ def doubtful_stretches(claimed: Claims, t_ns: Ints, element: Ints, read: Bools, 
 
 
 def off_stretches(claimed: Claims, epochs: MatchedEpochs, least_s: float) -> pl.DataFrame:
-    """Where the positions were on no path of the network, by what was known then; shorter ones are jumps.
+    """Stretches on no path of the network, by what was known then; shorter ones are jumps.
 
-    Named by the element beside which most of them lay; `offset_m` left of its own sense.
+    Named by the element next to which most of them lay; `offset_m` left of its own sense.
     """
     off = np.isnan(claimed.live) & epochs.near_track & (epochs.element >= 0)
     parts = []
@@ -300,11 +317,11 @@ def off_stretches(claimed: Claims, epochs: MatchedEpochs, least_s: float) -> pl.
             continue
         part = epochs.table[begin : last + 1]
         name = part["netelement_id"].mode().sort()[0]
-        beside = part.filter(pl.col("netelement_id") == name)
+        near_element = part.filter(pl.col("netelement_id") == name)
         turned = pl.cov("measure_m", "path_m").sign().fill_nan(1.0).fill_null(1.0)
         side = pl.when(turned < 0).then(-1.0).otherwise(1.0)
         parts.append(
-            beside.select(
+            near_element.select(
                 t_start=pl.lit(part["t"][0]),
                 t_end=pl.lit(part["t"][-1]),
                 netelement_id=pl.lit(name),
@@ -317,8 +334,10 @@ def off_stretches(claimed: Claims, epochs: MatchedEpochs, least_s: float) -> pl.
 
 
 def _possible(found: PathSet, spans: list[Span], epoch: Ints) -> Possible:
+    """Elements that hypotheses cover at each step, with a confidence shared among their lines."""
     count = len(found.steps)
     elements = found.network.count
+    # Step and element in one number, so that one `unique` sorts and removes doubles.
     keys = [np.arange(begin, end) * elements + node.element for node, begin, end, _ in spans]
     step, element = np.divmod(np.unique(np.concatenate([*keys, np.zeros(0, dtype=np.int64)])), elements)
     lines = np.unique(step * elements + found.groups[element]) // elements
@@ -327,7 +346,7 @@ def _possible(found: PathSet, spans: list[Span], epoch: Ints) -> Possible:
     return Possible(epoch, np.searchsorted(step, np.arange(count + 1)), element, confidence)
 
 
-def _left(found: PathSet, spans: list[Span], one_track: OneTrack | None = None) -> _Left:
+def _lines_left(found: PathSet, spans: list[Span], one_track: OneTrack | None = None) -> _LinesLeft:
     """What the sets come to, the likeliest line first; of equal ones that found first.
 
     `one_track`: a path is near the branch until the other branches of a switch that it came over are another track.
@@ -341,7 +360,7 @@ def _left(found: PathSet, spans: list[Span], one_track: OneTrack | None = None) 
     branch_m = np.full(count, np.inf)
     for node, begin, end, value in spans:
         own = int(found.groups[node.element])
-        _put(line[begin:end], element[begin:end], p[begin:end], (own, node.element), value)
+        _enter_path(line[begin:end], element[begin:end], p[begin:end], (own, node.element), value)
         beyond = np.array([beyond_m[2 * node.element + 1], beyond_m[2 * node.element]])
         ends_m = node.left_m[: end - begin] + beyond
         if one_track is not None:
@@ -349,10 +368,10 @@ def _left(found: PathSet, spans: list[Span], one_track: OneTrack | None = None) 
         part = slice(begin, begin + len(ends_m))
         branch_m[part] = np.minimum(branch_m[part], ends_m.min(axis=1))
     group = np.where(line[:, 1] < 0, line[:, 0], -2)
-    return _Left(group, line, element, p, branch_m)
+    return _LinesLeft(group, line, element, p, branch_m)
 
 
-def _put(line: Ints, element: Ints, p: Floats, one: tuple[int, int], value: Floats) -> None:
+def _enter_path(line: Ints, element: Ints, p: Floats, one: tuple[int, int], value: Floats) -> None:
     """Enter a path over a line and element with its p-values among the two likeliest lines of each step."""
     for place in (0, 1):
         better = (line[:, place] < 0) | (value > p[:, place])
@@ -365,8 +384,8 @@ def _put(line: Ints, element: Ints, p: Floats, one: tuple[int, int], value: Floa
         line[better, place], element[better, place], p[better, place] = *one, value[better]
 
 
-def _confidence(left: _Left, step: Ints, group: Ints, carried_m: Floats, alone: Floats) -> Floats:
-    """Of each epoch in its line, with the step that speaks for it; NaN off the network.
+def _confidence(left: _LinesLeft, step: Ints, group: Ints, carried_m: Floats, alone: Floats) -> Floats:
+    """Confidence of each epoch in its line, with the step that speaks for it; NaN off the network.
 
     Near a branch the rivals are those behind it: nothing is known of them yet.
     """
@@ -377,12 +396,12 @@ def _confidence(left: _Left, step: Ints, group: Ints, carried_m: Floats, alone: 
     return np.where(one, claimed, np.where(left.group[step] == -1, np.nan, doubted))
 
 
-def _hindsight(left: _Left, step: Ints, group: Ints, alone: Floats) -> Floats:
-    """By paths that live to the end; where one goes over from a line to the next, positions say when."""
+def _hindsight(left: _LinesLeft, step: Ints, group: Ints, alone: Floats) -> Floats:
+    """Confidence by paths that live to the end; where one goes over to the next line, positions say when."""
     confidence = _confidence(left, step, group, np.zeros(step.size), alone)
-    beside = [np.clip(step + by, 0, left.group.size - 1) for by in (-1, 0, 1)]
-    one = np.logical_and.reduce([left.group[row] >= 0 for row in beside])
-    one &= np.logical_or.reduce([left.group[row] == group for row in beside])
+    neighbours = [np.clip(step + by, 0, left.group.size - 1) for by in (-1, 0, 1)]
+    one = np.logical_and.reduce([left.group[row] >= 0 for row in neighbours])
+    one &= np.logical_or.reduce([left.group[row] == group for row in neighbours])
     return np.where(one & (confidence < ONE_TRACK_LEFT), ONE_TRACK_LEFT, confidence)
 
 

@@ -57,6 +57,13 @@ def fixes_of(frame: pl.DataFrame, sigma: FixSigma) -> Fixes:
     A receiver's covariance counts where both horizontal variances are positive (zero means not known in
     many logs); else the configuration's sigma by kind of fix stands in (DOMAIN section 3). A correlation that no
     covariance can have is not known: the variances stand alone.
+
+    Args:
+        frame: rows of one solution in order of time, shape (n,).
+        sigma: standard deviations by kind of fix [m].
+
+    Returns:
+        Arrays of shape (n,), NaN where not known.
     """
     column = {name: _floats(frame, name) for name in _NUMBERS}
     fix = _kinds(frame["fix"])
@@ -175,6 +182,7 @@ class Placed:
 
     @classmethod
     def on(cls, fixes: Fixes, path: TravelledPath, assignment: Assignment) -> Placed:
+        """Project every epoch onto its leg."""
         feet = path.feet(fixes.points, assignment.leg, fixes.valid, assignment.near_path_m)
         return cls(feet, *path.places(assignment.leg, feet, fixes.height_m))
 
@@ -226,11 +234,26 @@ def matched_epochs(
 
     `path_m` is the raw position projected, never smoothed: a jump of the GNSS stays a jump. It is given off
     track too (`on_track` false), and goes on straight beyond the ends of the path.
+
+    Args:
+        fixes: positions of one solution, arrays of shape (n,).
+        written: name of the solution and steps of its recorded coordinates [m].
+        path: the path shown.
+        assignment: leg and confidences of each epoch.
+        placed: foot of each epoch on its leg.
+        vehicle: the place of the GNSS antenna ahead of the balise antenna [m].
+        config: the section `matching` of the configuration.
+
+    Returns:
+        The matched epochs, arrays of shape (n,).
     """
     feet = placed.feet
     antenna_m = placed.antenna_m
     path_m = antenna_m - vehicle.gnss_antenna_ahead_m
-    element, measure_m = path.locate_index(assignment.leg, path_m)
+    piece, measure_m = path.locate_index(assignment.leg, path_m)
+    # The path's track may hold a net element in pieces, one after the other.
+    numbers = {name: number for number, name in enumerate(dict.fromkeys(path.track.ids))}
+    of_piece = [numbers[name] for name in path.track.ids]
     # The track's direction counts where the GNSS antenna is, not the balise antenna.
     shape = shape_at(path, assignment.leg, antenna_m)
     sigma_along_m, sigma_cross_m = track_sigmas_m(fixes, shape)
@@ -243,8 +266,8 @@ def matched_epochs(
         t_ns=fixes.t_ns,
         solution=written.solution,
         leg=np.where(fixes.valid, assignment.leg, -1),
-        element=element,
-        elements=path.track.ids,
+        element=np.array([*of_piece, -1])[piece],
+        elements=list(numbers),
         measure_m=measure_m,
         path_m=path_m,
         cross_track_m=feet.offset_m,
@@ -305,7 +328,7 @@ def track_sigmas_m(fixes: Fixes, shape: Shape) -> tuple[Floats, Floats]:
 
 
 def on_track_limit_m(sigma_cross_m: Floats, survey_sigma_m: Floats, config: MatchingConfig) -> Floats:
-    """How far beside a track its own sigma, the survey's and the bias allow a position to lie [m]."""
+    """How far off a track its own sigma, the survey's and the bias allow a position to lie [m]."""
     survey_m = np.where(np.isfinite(survey_sigma_m), survey_sigma_m, config.survey_sigma_default_m)
     spread_m = np.sqrt(sigma_cross_m**2 + survey_m**2 + config.on_track_bias_m**2)
     return np.asarray(np.minimum(config.on_track_sigmas * spread_m, config.reach_m))

@@ -44,7 +44,7 @@ def path_states(found: PathSet, height_m: Floats, sigma_up_m: Floats, config: Ma
     variance_m2 = (config.cross_bias_sigma_m**2 + steps.sigma_m**2)[candidates.step]
     most = config.outlier_sigmas**2
     cost = np.minimum(candidates.distance_m**2 / variance_m2, most)
-    refuted = _refuted(found, candidates)
+    refuted = _are_refuted(found, candidates)
     cost = np.where(refuted, most, cost + _height_costs(candidates, height_m, sigma_up_m, config))
     candidates = candidates.renumbered(kept)
     both = np.column_stack([2 * candidates.element, 2 * candidates.element + 1])
@@ -80,13 +80,14 @@ def unbroken(states: PathStates, steps: PathSteps, config: MatchingConfig) -> Bo
     return np.asarray(same & at_once & soon & ((count == 1) | (np.diff(spell, prepend=-1.0) == 0.0)))
 
 
-def _refuted(found: PathSet, candidates: Candidates) -> Bools:
+def _are_refuted(found: PathSet, candidates: Candidates) -> Bools:
     """Candidates on an element that the whole run refutes; none where every path is refuted."""
     count = len(found.steps)
     elements = found.network.count
     lives = found.to_the_end()
     # Between two elements a step belongs to either.
     spans = [(node.element, max(begin - 1, 0), min(end + 1, count)) for node, begin, end, _ in lives]
+    # Step and element in one number, to be looked up by `isin`.
     keys = [np.arange(begin, end) * elements + element for element, begin, end in spans]
     possible = np.unique(np.concatenate([*keys, np.zeros(0, dtype=np.int64)]))
     known = np.zeros(count, dtype=np.bool_)
@@ -97,7 +98,7 @@ def _refuted(found: PathSet, candidates: Candidates) -> Bools:
 
 
 def _height_costs(candidates: Candidates, height_m: Floats, sigma_up_m: Floats, config: MatchingConfig) -> Floats:
-    """Of the height over the track, where tracks lie over each other; none without heights.
+    """Cost of each candidate by the height over its track, where tracks lie over each other; 0 without heights.
 
     Tracks at one level differ by superelevation and errors of the survey, which say nothing of the train.
     """
@@ -106,6 +107,7 @@ def _height_costs(candidates: Candidates, height_m: Floats, sigma_up_m: Floats, 
         return np.zeros(track_m.size)
     begin = candidates.first[:-1][np.diff(candidates.first) > 0]
     of_step = np.repeat(np.arange(begin.size), np.diff(np.append(begin, track_m.size)))
+    # How far the highest and the lowest candidate of each step are apart.
     apart_m = (np.maximum.reduceat(track_m, begin) - np.minimum.reduceat(track_m, begin))[of_step]
     variance_m2 = sigma_up_m[candidates.step] ** 2 + config.height_bias_sigma_m**2
     square = (height_m[candidates.step] - track_m) ** 2 / variance_m2
@@ -116,10 +118,10 @@ def _height_costs(candidates: Candidates, height_m: Floats, sigma_up_m: Floats, 
 def polarity_of_parts(network: Network, states: PathStates, counted_m: Floats) -> Ints:
     """Sign of the odometer against each oriented element: +1, -1, or 0 where unknown.
 
-    `counted_m`: per step of the states the way since the step before, signed, NaN where unknown. The sign belongs to
-    the installation and holds for the whole run, but the orientation of a connected part of the network is arbitrary:
-    so one sign for each part, by the votes of all states that stay on one element for a step. Of the path shown, which
-    looks back; the sign that the train counts with is `odometry.polarity`, by the first metres on that path.
+    `counted_m`: per step of the states the distance since the step before, signed, NaN where unknown. The sign belongs
+    to the installation and holds for the whole run, but the orientation of a connected part of the network is
+    arbitrary: so one sign for each part, by the votes of all states that stay on one element for a step. Of the path
+    shown, which looks back; the sign that the train counts with is `odometry.polarity`, by the first metres on it.
     """
     count = len(network.successors)
     if not network.orientable:
@@ -141,7 +143,7 @@ _LEFT_OUT = 1.0
 
 @frozen(eq=False)
 class _Reached:
-    """The cheapest way to a state of a block; `place`: at its last step."""
+    """The cheapest path to a state of a block; `place`: at its last step."""
 
     cost: float
     block: int
@@ -151,7 +153,7 @@ class _Reached:
 
 
 @frozen
-class Course:
+class PathCourse:
     """Steps of the set in order of time with the oriented element of the path at each, and metres from its entry."""
 
     step: Ints
@@ -159,20 +161,21 @@ class Course:
     place_m: Floats
 
     def place(self, row: int) -> Place:
+        """Place of the train at one of the steps."""
         return Place(int(self.step[row]), int(self.oriented[row]), float(self.place_m[row]))
 
 
-def least_squares(states: PathStates, moves: Moves) -> Course:
+def least_squares(states: PathStates, moves: Moves) -> PathCourse:
     """The steps that lie on the path of least cost."""
-    begins = np.flatnonzero(~(unbroken(states, moves.steps, moves.config) & _apart(states, moves)))
+    begins = np.flatnonzero(~(unbroken(states, moves.steps, moves.config) & _without_relations(states, moves)))
     ends = np.append(begins[1:], len(states.step))
     alive: dict[int, _Reached] = {}
     for block, (begin, end) in enumerate(zip(begins.tolist(), ends.tolist(), strict=True)):
-        alive = _entered(states, moves, alive, block, begin, end)
-    return _course(states, begins, ends, min(alive.values(), key=lambda reached: reached.cost))
+        alive = _extend_to_block(states, moves, alive, block, begin, end)
+    return _trace_back(states, begins, ends, min(alive.values(), key=lambda reached: reached.cost))
 
 
-def _apart(states: PathStates, moves: Moves) -> Bools:
+def _without_relations(states: PathStates, moves: Moves) -> Bools:
     """Steps at which no state leads to another at once."""
     apart = np.ones(len(states.step), dtype=np.bool_)
     known: dict[tuple[int, ...], bool] = {}
@@ -186,10 +189,10 @@ def _apart(states: PathStates, moves: Moves) -> Bools:
     return apart
 
 
-def _entered(
+def _extend_to_block(
     states: PathStates, moves: Moves, alive: dict[int, _Reached], block: int, begin: int, end: int
 ) -> dict[int, _Reached]:
-    """The cheapest way to each state of a block of steps with the same states, and those carried on past it."""
+    """The cheapest path to each state of a block of steps with the same states, and those carried on past it."""
     rows = slice(int(states.first[begin]), int(states.first[begin + 1]))
     size = rows.stop - rows.start
     sums = states.cost[rows.start : int(states.first[end])].reshape(end - begin, size).sum(axis=0).tolist()
@@ -197,7 +200,7 @@ def _entered(
     first_m = states.place_m[rows].tolist()
     last_m = states.place_m[int(states.first[end - 1]) :][:size].tolist()
     step = int(states.step[begin])
-    ways = {at: moves.way(at, step) for at in {reached.place.step for reached in alive.values()}}
+    distances = {at: moves.distance(at, step) for at in {reached.place.step for reached in alive.values()}}
     cheapest = min(alive.values(), key=lambda reached: reached.cost, default=None)
     after: dict[int, _Reached] = {}
     for number, here in enumerate(oriented):
@@ -206,7 +209,7 @@ def _entered(
         before = cheapest
         for reached in alive.values():
             if reached.cost < least:
-                cost = reached.cost + moves.cost(reached.place, there, ways[reached.place.step])
+                cost = reached.cost + moves.cost(reached.place, there, distances[reached.place.step])
                 if cost < least:
                     least, before = cost, reached
         place = Place(int(states.step[end - 1]), here, last_m[number])
@@ -222,8 +225,8 @@ def _entered(
     return after
 
 
-def _course(states: PathStates, begins: Ints, ends: Ints, last: _Reached) -> Course:
-    """Follow the cheapest way back."""
+def _trace_back(states: PathStates, begins: Ints, ends: Ints, last: _Reached) -> PathCourse:
+    """Follow the cheapest path back."""
     parts: list[Ints] = []
     rows: list[Ints] = []
     reached: _Reached | None = last
@@ -234,7 +237,7 @@ def _course(states: PathStates, begins: Ints, ends: Ints, last: _Reached) -> Cou
         reached = reached.before
     part = np.concatenate(parts[::-1])
     row = np.concatenate(rows[::-1])
-    return Course(states.step[part], states.oriented[row], states.place_m[row])
+    return PathCourse(states.step[part], states.oriented[row], states.place_m[row])
 
 
 @frozen
@@ -247,7 +250,7 @@ class Decoded:
     place_m: Floats
 
     def turned(self, network: Network, legs: range) -> Decoded:
-        """Some legs run the other way round."""
+        """Some legs run in the other direction."""
         chains = tuple(chain.turned(network) if index in legs else chain for index, chain in enumerate(self.chains))
         inside = (self.leg >= legs.start) & (self.leg < legs.stop)
         length = np.array(
@@ -260,7 +263,7 @@ class Decoded:
         return Decoded(chains, self.leg, number, np.where(inside, length - self.place_m, self.place_m))
 
 
-def decode(course: Course, moves: Moves) -> Decoded:
+def decode(course: PathCourse, moves: Moves) -> Decoded:
     """Follow the course over the network, elements without any fix included."""
     oriented = course.oriented
     chains = [Chain((int(oriented[0]),), (0.0,))]
@@ -268,7 +271,7 @@ def decode(course: Course, moves: Moves) -> Decoded:
     number = np.zeros(len(oriented), dtype=np.int64)
     at = 0
     before = 0
-    for row in np.flatnonzero(_to_be_asked(course)).tolist():
+    for row in np.flatnonzero(_element_changes(course)).tolist():
         leg[before:row] = len(chains) - 1
         number[before:row] = at
         before = row
@@ -279,12 +282,12 @@ def decode(course: Course, moves: Moves) -> Decoded:
     return Decoded(tuple(chains), leg, number, course.place_m)
 
 
-def _to_be_asked(course: Course) -> Bools:
+def _element_changes(course: PathCourse) -> Bools:
     """Rows at which the course comes to another element."""
     return np.concatenate([[False], course.oriented[1:] != course.oriented[:-1]])
 
 
-def legs_of(moves: Moves, course: Course, decoded: Decoded) -> list[Leg]:
+def legs_of(moves: Moves, course: PathCourse, decoded: Decoded) -> list[Leg]:
     """Legs with one path position: equal on what two legs share, carried on by distance over a break."""
     legs: list[Leg] = []
     for index, chain in enumerate(decoded.chains):
@@ -295,7 +298,7 @@ def legs_of(moves: Moves, course: Course, decoded: Decoded) -> list[Leg]:
             there = legs[-1].entry_m(chain.shared - before.low)
             leg = shifted(leg, there - leg.entry_m(chain.shared - chain.low))
         elif legs:
-            leg = shifted(leg, _over_break(moves, course, decoded, legs[-1], leg, index))
+            leg = shifted(leg, _shift_over_break_m(moves, course, decoded, legs[-1], leg, index))
         legs.append(leg)
     return legs
 
@@ -313,7 +316,7 @@ def positions_m(decoded: Decoded, legs: list[Leg]) -> Floats:
     )
 
 
-def aligned(moves: Moves, course: Course, decoded: Decoded) -> Decoded:
+def aligned(moves: Moves, course: PathCourse, decoded: Decoded) -> Decoded:
     """After a break the path goes on in the direction it had: legs beyond it are turned where needed."""
     for index, chain in enumerate(decoded.chains):
         if index and chain.shared is None:
@@ -336,27 +339,31 @@ def _follow(chains: list[Chain], network: Network, at: int, move: Move | None, t
 
 
 def _next_break(decoded: Decoded, index: int) -> int:
+    """The next leg that shares no element with the one before it, else the number of legs."""
     later = range(index + 1, len(decoded.chains))
     return next((number for number in later if decoded.chains[number].shared is None), len(decoded.chains))
 
 
-def _border(decoded: Decoded, index: int) -> int:
+def _first_step(decoded: Decoded, index: int) -> int:
     """First step of a leg."""
     return int(np.searchsorted(decoded.leg, index))
 
 
 def _heading_at(decoded: Decoded, legs: list[Leg], index: int, before: bool = False) -> float:
-    step = _border(decoded, index) - before
+    """Heading of the track at the first step of a leg, or at the step before it [deg]."""
+    step = _first_step(decoded, index) - before
     leg = legs[int(decoded.leg[step])]
     segment, _ = segments_at(leg, positions_m(decoded, legs)[[step]])
     return float(leg.heading_deg[segment[0]])
 
 
-def _over_break(moves: Moves, course: Course, decoded: Decoded, before: Leg, after: Leg, index: int) -> float:
+def _shift_over_break_m(
+    moves: Moves, course: PathCourse, decoded: Decoded, before: Leg, after: Leg, index: int
+) -> float:
     """Shift of a leg beyond a break, so that path position grows by the distance in between."""
-    step = _border(decoded, index)
+    step = _first_step(decoded, index)
     last = decoded.chains[index - 1]
     there = before.entry_m(int(decoded.number[step - 1]) - last.low) + float(decoded.place_m[step - 1])
     here = after.entry_m(int(decoded.number[step]) - decoded.chains[index].low) + float(decoded.place_m[step])
-    way = moves.way(int(course.step[step - 1]), int(course.step[step]))
-    return there + abs(way.distance_m) - here
+    distance = moves.distance(int(course.step[step - 1]), int(course.step[step]))
+    return there + abs(distance.distance_m) - here

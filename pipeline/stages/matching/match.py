@@ -11,8 +11,8 @@ from pipeline.stages.epochs.clock import least_belief
 from pipeline.stages.matching.claims import Possible, claims, doubtful_stretches, off_stretches
 from pipeline.stages.matching.epochs import Assignment, Fixes, Placed, Written, digit_steps, fixes_of, matched_epochs
 from pipeline.stages.matching.least_squares import (
-    Course,
     Decoded,
+    PathCourse,
     aligned,
     decode,
     least_squares,
@@ -42,7 +42,23 @@ from schemas.stages import ONE_TRACK_LEFT, MatchedEpochs
 def find_path(
     fixes: Fixes, odometry: Odometry | None, found: PathSet, config: MatchingConfig
 ) -> tuple[TravelledPath, Assignment]:
-    """The path shown, and each epoch's leg on it. Raises `InputError` where no position is near any track."""
+    """The path shown, and each epoch's leg on it.
+
+    Args:
+        fixes: positions of one solution, arrays of shape (n,).
+        odometry: the odometer of the run, or None.
+        found: the paths that the positions do not reject.
+        config: the section `matching` of the configuration.
+
+    Returns:
+        The path of least squares, and the leg and path position of each epoch (shape (n,)).
+
+    Raises:
+        InputError: no position is near any track.
+
+    Source:
+        DOMAIN section 2, rule 8 (Viterbi 1967).
+    """
     network = found.network
     if not found.candidates.step.size:
         raise off_the_network(fixes, network.track, config)
@@ -73,7 +89,7 @@ def _middle_rows(fixes: Fixes, steps: PathSteps) -> Ints:
     return np.asarray(rows[np.minimum(np.searchsorted(fixes.t_ns[rows], steps.t_ns), rows.size - 1)])
 
 
-def _assign(fixes: Fixes, steps: PathSteps, course: Course, decoded: Decoded, at_m: Floats) -> Assignment:
+def _assign(fixes: Fixes, steps: PathSteps, course: PathCourse, decoded: Decoded, at_m: Floats) -> Assignment:
     """Every epoch by the step that it is in, or the one before it: its place moved on towards the next step.
 
     Between the steps of two legs an epoch belongs to the later one.
@@ -125,6 +141,7 @@ def off_the_network(fixes: Fixes, track: SurveyedTrack, config: MatchingConfig) 
 
 
 def _length(metres: float) -> str:
+    """A length for people, in km from 10 km on."""
     return f"{metres / 1000:.0f} km" if metres >= 10_000 else f"{metres:.0f} m"
 
 
@@ -153,25 +170,40 @@ def match(
     fix_sigma: FixSigma,
     balise_reads: pl.DataFrame | None = None,
 ) -> Match:
-    """Place one solution's epochs (ordered, unique `t`) on the site's track.
+    """Place one solution's epochs on the site's track.
 
-    `odometry`: of the run, as recorded, or none. Raises `InputError` where no
-    epoch comes near any track.
+    Args:
+        fixes: `gnss` rows of one solution, in order of unique `t`, shape (n,).
+        odometry: the odometer of the run as recorded, or None.
+        site: track, links, balises and, if given, the route.
+        vehicle: places of the antennas [m].
+        config: the section `matching` of the configuration.
+        fix_sigma: standard deviations by kind of fix, for rows without a covariance [m].
+        balise_reads: telegrams received (`t`, `balise_id`), which say on which net element the train was.
+
+    Returns:
+        The epochs on the path (shape (n,)), the path, and where it was in doubt.
+
+    Raises:
+        InputError: no row has a position, or no position comes near any track.
+
+    Source:
+        DOMAIN section 2.
     """
     arrays = fixes_of(fixes, fix_sigma)
     arrays = replace(arrays, height_m=arrays.height_m - vehicle.antenna_height_m)
     if not arrays.valid.any():
         raise InputError("no epoch has a position", place="gnss", expected="latitude, longitude and a fix")
     network = network_in_pieces(site).unsearched()
-    pinned = read_elements(arrays, site, network.track, balise_reads)
+    read_element = read_elements(arrays, site, network.track, balise_reads)
     rows = np.flatnonzero(arrays.valid)
     steps = path_steps(
         arrays.t_ns[rows],
         arrays.points.take(rows),
         np.sqrt(0.5 * (arrays.cov_ee_m2 + arrays.cov_nn_m2))[rows],
-        way=None if odometry is None else odometry.distance_between,
+        distance=None if odometry is None else odometry.distance_between,
         independent=odometry is not None and odometry.independent,
-        pinned=_read_elements_of_positions(pinned, rows),
+        read_elements=_read_elements_of_positions(read_element, rows),
     )
     found = path_set(steps, network, config)
     path, assignment = find_path(arrays, odometry, found, config)
@@ -181,7 +213,7 @@ def match(
     since_s = (arrays.t_ns - arrays.t_ns[rows[0]]) / NS_PER_S
     claimed = claims(found, since_s, element, np.sqrt(0.5 * (arrays.cov_ee_m2 + arrays.cov_nn_m2)), config)
     assignment = replace(assignment, path_probability=claimed.hindsight, gate_probability=claimed.live)
-    ambiguous = doubtful_stretches(claimed, arrays.t_ns, element, pinned >= 0, network)
+    ambiguous = doubtful_stretches(claimed, arrays.t_ns, element, read_element >= 0, network)
     written = Written(str(fixes["solution"][0]), *digit_steps(fixes, fix_sigma.digits_least_m))
     epochs = matched_epochs(arrays, written, path, assignment, placed, vehicle, config)
     sign = _odometer_sign(odometry, epochs, config)
@@ -200,12 +232,12 @@ def elements_of(fixes: Fixes, path: TravelledPath, assignment: Assignment, place
     return np.where(fixes.valid & np.isfinite(placed.antenna_m), element, -1)
 
 
-def _read_elements_of_positions(pinned: Ints, rows: Ints) -> Ints:
+def _read_elements_of_positions(read_element: Ints, rows: Ints) -> Ints:
     """The element of each read at the position that it belongs to: the last one not after its epoch."""
-    read_element = np.full(rows.size, -1, dtype=np.int64)
-    read = np.flatnonzero(pinned >= 0)
-    read_element[np.maximum(np.searchsorted(rows, read, side="right") - 1, 0)] = pinned[read]
-    return read_element
+    of_position = np.full(rows.size, -1, dtype=np.int64)
+    read = np.flatnonzero(read_element >= 0)
+    of_position[np.maximum(np.searchsorted(rows, read, side="right") - 1, 0)] = read_element[read]
+    return of_position
 
 
 def _odometer_sign(odometry: Odometry | None, epochs: MatchedEpochs, config: MatchingConfig) -> int:
@@ -217,10 +249,10 @@ def _odometer_sign(odometry: Odometry | None, epochs: MatchedEpochs, config: Mat
 
 
 def read_elements(fixes: Fixes, site: Site, track: SurveyedTrack, balise_reads: pl.DataFrame | None) -> Ints:
-    """Per epoch the element of the balise read then (at the first epoch not before the read), else -1."""
-    pinned = np.full(len(fixes), -1, dtype=np.int64)
+    """Element of the balise read at each epoch (the first not before the read), else -1."""
+    read_element = np.full(len(fixes), -1, dtype=np.int64)
     if balise_reads is None or site.balises is None:
-        return pinned
+        return read_element
     # Of an element that is passed twice, or about a cut, a read does not say which it was.
     rows, elements = track.holding(site.balises)
     alone = np.flatnonzero(np.bincount(rows)[rows] == 1)
@@ -228,8 +260,8 @@ def read_elements(fixes: Fixes, site: Site, track: SurveyedTrack, balise_reads: 
     read = balise_reads.select("t", "balise_id").join(places, on="balise_id", maintain_order="left")
     epoch = np.searchsorted(fixes.t_ns, times_ns(read))
     inside = epoch < len(fixes)
-    pinned[epoch[inside]] = ints(read["element"])[inside]
-    return pinned
+    read_element[epoch[inside]] = ints(read["element"])[inside]
+    return read_element
 
 
 ROUTE_COLUMNS: dict[str, pl.DataType | type[pl.DataType]] = {
@@ -249,10 +281,10 @@ ROUTE_COLUMNS: dict[str, pl.DataType | type[pl.DataType]] = {
 def travelled_route(match: Match) -> pl.DataFrame:
     """One row per net element in the order of growing path, leg by leg: the route, and what of it is in doubt.
 
-    `doubtful`: the track was, at the time or in hindsight (the least probabilities of both stand beside it), or no
-    position tells of it. `rivals`: other elements possible
-    meanwhile, the most probable first, each with its highest probability, in words. `cross_bias_m`: by how much the
-    positions lie left of growing path there (median), which survey and antenna do and no GNSS fault.
+    `doubtful`: the track was, at the time or in hindsight (the least probabilities of both stand next to it), or no
+    position tells of it. `rivals`: other elements possible meanwhile, the most probable first, each with its highest
+    probability, in words. `cross_bias_m`: by how much the positions lie left of growing path there (median), which
+    survey and antenna do and no GNSS fault.
     """
     leg = match.epochs.leg
     rows = [
@@ -264,7 +296,7 @@ def travelled_route(match: Match) -> pl.DataFrame:
 
 
 def _passages(track: SurveyedTrack, leg: Leg) -> list[list[int]]:
-    """Visits that are one passage of an element: its pieces, one after the other. Each lap of a ring is another."""
+    """Visits that are one passage of an element: its pieces, one after the other. Each circuit of a ring is another."""
     passages: list[list[int]] = []
     ended: object = None
     for number, visit in enumerate(leg.visits):
@@ -279,6 +311,7 @@ def _passages(track: SurveyedTrack, leg: Leg) -> list[list[int]]:
 
 
 def _row(match: Match, number: int, leg: Leg, visits: list[int], on_leg: Bools) -> tuple[object, ...]:
+    """One row of `ROUTE_COLUMNS`: a passage of a net element on the leg of this number."""
     path_m = match.epochs.path_m
     segment, _ = segments_at(leg, np.nan_to_num(path_m))
     known = np.isfinite(match.epochs.path_probability)

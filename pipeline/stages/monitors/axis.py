@@ -56,6 +56,7 @@ class AxisState:
 
     @classmethod
     def at_restart(cls, alphas: int, sources: int, lasting: int = 0) -> AxisState:
+        """All zero; `lasting`: number of errors that stay."""
         zero = np.zeros(alphas)
         return cls(zero, zero, np.zeros((alphas, sources)), zero, zero, np.zeros((lasting, alphas)))
 
@@ -118,7 +119,7 @@ def noise_of_ewma(
 
 
 def _memory(sigma_m: Floats, sigma_before_m: Floats, decorrelation: Floats) -> tuple[Floats, Floats, Floats]:
-    """Of the recursion: phi r, s_k (s_k - phi s_p) and phi r - 1; shapes (n, sources)."""
+    """Terms of the recursion: phi r, s_k (s_k - phi s_p) and phi r - 1; shapes (n, sources)."""
     if np.array_equal(sigma_m, sigma_before_m):
         return 1.0 - decorrelation, sigma_m * (decorrelation * sigma_m), -decorrelation
     ratio = np.divide(sigma_m, sigma_before_m, out=np.ones_like(sigma_m), where=sigma_before_m > 0.0)
@@ -128,7 +129,7 @@ def _memory(sigma_m: Floats, sigma_before_m: Floats, decorrelation: Floats) -> t
 
 
 def before_steps(sigma_m: Floats, decorrelation: Floats, factor: float) -> Floats:
-    """Per source the sigma s_p at the row before, for the recursion; shapes (n, sources).
+    """Sigma s_p of each source at the row before, for the recursion; shapes (n, sources).
 
     Before the first step of a source (a change of its sigma by more than `factor`) the row's own, as printed. Sources
     without memory have no step.
@@ -145,7 +146,7 @@ def before_steps(sigma_m: Floats, decorrelation: Floats, factor: float) -> Float
 
 
 def increment_variance(sigma_m: Floats, sigma_before_m: Floats, decorrelation: Floats) -> Floats:
-    """Of all sources together [m^2]; shape (n,). 2 R (1-phi) where R stays."""
+    """Variance of the increments by all sources together [m^2], shape (n,); 2 R (1-phi) where R stays."""
     correlated = 2.0 * decorrelation * sigma_m * sigma_before_m
     if np.array_equal(sigma_m, sigma_before_m):
         return np.asarray(correlated.sum(axis=1))
@@ -180,6 +181,7 @@ class AxisSeries:
     lasting_mps: Floats
 
     def between(self, low: int, high: int) -> AxisSeries:
+        """Its rows [low, high)."""
         return AxisSeries(**{item.name: getattr(self, item.name)[low:high] for item in fields(self)})
 
 
@@ -187,8 +189,8 @@ Source = tuple[Floats, Floats]
 """An error that positions share from row to row: its deviation [m], and 1 - phi over the step to each row."""
 
 
-def errors_of(sigma_m: Floats, dt_s: Floats, beside: Sequence[Source], config: MonitorConfig) -> dict[str, Floats]:
-    """The error fields of a series: four Gauss-Markov errors of positions of this sigma, and those `beside` them.
+def errors_of(sigma_m: Floats, dt_s: Floats, further: Sequence[Source], config: MonitorConfig) -> dict[str, Floats]:
+    """The error fields of a series: four Gauss-Markov errors of positions of this sigma, and `further` ones.
 
     Error j of a share of the variance has sigma_j = sqrt(share_j) sigma and 1 - phi_j = 1 - exp(-dt / tau_j) (DIAG
     Table 1). Transposed into Fortran order, as the recursions go along the rows.
@@ -196,7 +198,7 @@ def errors_of(sigma_m: Floats, dt_s: Floats, beside: Sequence[Source], config: M
     sources = [
         (np.sqrt(share) * sigma_m, -np.expm1(-dt_s / tau_s)) for share, tau_s in zip(*error_model(config), strict=True)
     ]
-    sources += beside
+    sources += further
     sigmas = np.vstack([sigma for sigma, _ in sources]).T
     decorrelations = np.vstack([lost for _, lost in sources]).T
     before = before_steps(sigmas, decorrelations, config.sigma_step_factor)
@@ -221,15 +223,25 @@ def time_steps(t_s: Floats, gap_reset_s: float) -> tuple[Floats, Bools]:
 def run_axis(
     series: AxisSeries, alphas: Floats, state: AxisState | None = None, noise_m2: Floats | None = None
 ) -> tuple[Floats, Floats, AxisState]:
-    """Values and sigmas of the axis [m/s] from `state`, or from a restart, on, and the state to carry on with.
+    """Values and sigmas of the monitors of one axis, from `state` or from a restart on.
 
-    Shapes (rows, 1 + alphas): raw, then the EWMAs. `noise_m2`: of the same shape, the fast noise beyond the model;
-    where it is NaN, so is the sigma.
+    Args:
+        series: increments of the axis, m rows.
+        alphas: weights of the EWMAs over one second [1], shape (a,).
+        state: what the recursions carry on from the row before; None: a restart.
+        noise_m2: fast noise beyond the model [m^2], shape (m, 1 + a); None: none; where NaN, so is the sigma.
+
+    Returns:
+        Values and sigmas [m/s], shape (m, 1 + a): raw, then the EWMAs; and the state to carry on with.
+
+    Source:
+        DIAG eq. 4-9; DOMAIN section 3, rule 2.
     """
     noise_m2 = np.zeros((series.dt_s.size, 1 + alphas.size)) if noise_m2 is None else noise_m2
     known_m2 = np.nan_to_num(noise_m2)
     state = state or AxisState.at_restart(alphas.size, series.sigma_m.shape[1], series.lasting_mps.shape[1])
     moving = ~series.fresh
+    # A row that restarts has weight, keep and gain 0: nothing of before is carried over it.
     weight = ewma_weight(alphas, series.dt_s) * moving[:, None]
     keep = (1.0 - weight) * moving[:, None]
     gain = weight / series.dt_s[:, None]
@@ -281,11 +293,24 @@ class AlongEpochs:
 
 
 def along_series(epochs: AlongEpochs, odometer: Increments, config: Configuration) -> AxisSeries:
+    """Increments of GNSS minus odometer along the track, divided by their time, with their errors.
+
+    Args:
+        epochs: epochs with a position and an odometer, arrays of shape (m,).
+        odometer: distance [m] and change of speed [m/s] from the epoch before, shape (m,).
+        config: the configuration; used are `align.gap_reset_s` and `monitors`.
+
+    Returns:
+        The series, arrays of m rows.
+
+    Source:
+        DIAG eq. 1-3.
+    """
     dt, fresh = time_steps(epochs.t_s, config.align.gap_reset_s)
     zero = np.zeros(dt.size)
     # New at each epoch: a stamp's error times the speed, and the digits. The odometer's rows lose theirs by and by.
     memoryless_m = np.hypot(epochs.jitter_s * odometer.distance_m / dt, epochs.digits_m)
-    beside = [
+    further = [
         (np.abs(memoryless_m), np.ones(dt.size)),
         (epochs.rows_m, _rows_decorrelation(dt, epochs.period_s, config.monitors)),
     ]
@@ -295,7 +320,7 @@ def along_series(epochs: AlongEpochs, odometer: Increments, config: Configuratio
         border=np.zeros(dt.size, dtype=np.bool_),
         dt_s=dt,
         rate_mps=(np.diff(epochs.along_m, prepend=epochs.along_m[:1]) - odometer.distance_m) / dt,
-        **errors_of(epochs.sigma_m, dt, beside, config.monitors),
+        **errors_of(epochs.sigma_m, dt, further, config.monitors),
         white_m2=epochs.white_m2_per_s * dt,
         border_m2=zero,
         lasting_mps=np.column_stack(

@@ -1,10 +1,9 @@
-"""The three axes of the bank from aligned epochs: which are usable, and what leads from one to the next."""
+"""The bank of monitors with memory, as the LDS asks it: what each says of an epoch, from the last restart on."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import replace
-from typing import Literal
 
 import numpy as np
 import polars as pl
@@ -12,8 +11,6 @@ import polars as pl
 from pipeline.stages.epochs.verdicts import (
     DISABLED,
     FAIL,
-    NO_POSITION,
-    NO_SIGMA,
     NOT_EVALUATED,
     NUMBER,
     PASS,
@@ -24,170 +21,16 @@ from pipeline.stages.epochs.verdicts import (
     states_of,
     verdicts,
 )
-from pipeline.stages.monitors.axis import (
-    BLOCK,
-    FIRST_BLOCK,
-    AlongEpochs,
-    AxisSeries,
-    AxisState,
-    Source,
-    along_series,
-    errors_of,
-    run_axis,
-    time_steps,
-)
+from pipeline.stages.monitors.axes import Axis, axes_of
+from pipeline.stages.monitors.axis import BLOCK, FIRST_BLOCK, AxisSeries, AxisState, run_axis
 from pipeline.stages.monitors.noise import OF_WALK, OF_WHITE_NOISE, NoiseMeter
-from pipeline.stages.odometry.driven import under_way
-from pipeline.stages.odometry.odometry import Increments
 from schemas.arrays import Bools, Floats, Ints
-from schemas.config import Configuration, MonitorConfig
+from schemas.config import Configuration
 from schemas.enums import NotEvaluated
-from schemas.frozen import frozen
-from schemas.stages import NO_REASON, AlignedEpochs
+from schemas.stages import AlignedEpochs
 from schemas.tables import SCALES
 
-OFF_TRACK = NotEvaluated.OFF_TRACK
-NO_HEIGHT = NotEvaluated.NO_HEIGHT
 FIRST_EPOCH = NotEvaluated.FIRST_EPOCH
-_STRAIGHT_PER_M = 1e-6
-
-
-@frozen
-class Axis:
-    """Its increments, at which of them the train moves, and per epoch why there is none (`NO_REASON`: there is)."""
-
-    name: str
-    series: AxisSeries
-    moving: Bools
-    reasons: Ints
-
-
-def along_axis(epochs: AlignedEpochs, config: Configuration) -> Axis:
-    """DIAG eq. 1-3."""
-    t_s = (epochs.t_ns - epochs.t_ns[0]) * 1e-9
-    matched = _match_reasons(epochs)
-    reasons = otherwise(matched, epochs.odometer_reason)
-    series = _along(epochs, t_s, reasons, config)
-    return Axis("along", series, _moving(epochs, t_s, config)[series.epoch], reasons)
-
-
-def axes_of(epochs: AlignedEpochs, config: Configuration) -> tuple[Axis, Axis, Axis]:
-    """DIAG eq. 1-3 and 10-15."""
-    t_s = (epochs.t_ns - epochs.t_ns[0]) * 1e-9
-    matched = _match_reasons(epochs)
-    up_reasons = otherwise(matched, first_reason((np.isnan(epochs.vertical_m), NO_HEIGHT)))
-    moving = _moving(epochs, t_s, config)
-    built = (
-        ("cross", _across(epochs, t_s, matched, "cross", config), matched),
-        ("up", _across(epochs, t_s, up_reasons, "up", config), up_reasons),
-    )
-    cross, up = (Axis(name, series, moving[series.epoch], reasons) for name, series, reasons in built)
-    return along_axis(epochs, config), cross, up
-
-
-def _moving(epochs: AlignedEpochs, t_s: Floats, config: Configuration) -> Bools:
-    """By the odometer: noise of the rows at a stand is no way driven."""
-    way_m = epochs.travelled_m
-    deadband_mps = config.matching.deadband_mps
-    known = np.isfinite(way_m)
-    if not known.any():
-        return np.asarray(np.abs(np.nan_to_num(epochs.speed_mps)) > deadband_mps)
-    return under_way(t_s, np.interp(t_s, t_s[known], way_m[known]), deadband_mps, config.align.speed_window_s)
-
-
-def _match_reasons(epochs: AlignedEpochs) -> Ints:
-    """Why the match gives no position that the bank could use."""
-    no_sigma = np.isnan(epochs.sigma_along_m) | np.isnan(epochs.sigma_cross_m)
-    return first_reason((~epochs.fix_valid, NO_POSITION), (~epochs.near_track, OFF_TRACK), (no_sigma, NO_SIGMA))
-
-
-def _along(epochs: AlignedEpochs, t_s: Floats, reasons: Ints, config: Configuration) -> AxisSeries:
-    rows = np.flatnonzero(reasons == NO_REASON)
-    at_rows = AlongEpochs(
-        epoch=rows,
-        t_s=t_s[rows],
-        along_m=epochs.along_m[rows],
-        doubt_m=epochs.odometer_doubt_m[rows],
-        sigma_m=epochs.calibrated_along_m[rows],
-        digits_m=epochs.digits_along_m[rows],
-        jitter_s=epochs.stamp_jitter_s[rows],
-        scale_sigma=epochs.scale_sigma[rows],
-        latency_sigma_s=epochs.latency_sigma_s[rows],
-        white_m2_per_s=epochs.odometer_white_m2_per_s[rows],
-        rows_m=epochs.odometer_rows_m[rows],
-        period_s=epochs.odometer_period_s[rows],
-    )
-    return along_series(at_rows, Increments(_steps(epochs.odometer_m[rows]), _steps(epochs.speed_mps[rows])), config)
-
-
-def _across(
-    epochs: AlignedEpochs, t_s: Floats, reasons: Ints, axis: Literal["cross", "up"], config: Configuration
-) -> AxisSeries:
-    """Cross-track or vertical; the chord error of a coarse survey is one more correlated source."""
-    rows = np.flatnonzero(reasons == NO_REASON)
-    dt, fresh = time_steps(t_s[rows], config.align.gap_reset_s)
-    element = epochs.netelement_id.rle_id().to_numpy()[rows]
-    survey = np.nan_to_num(epochs.survey_sigma_m[rows], nan=config.matching.survey_sigma_default_m)
-    if axis == "cross":
-        position_m, sigma_m, digits_m = epochs.cross_track_m, epochs.calibrated_cross_m, epochs.digits_cross_m
-    else:
-        position_m, sigma_m, digits_m = epochs.vertical_m, epochs.calibrated_up_m, epochs.digits_up_m
-    coarse = digits_m[rows], np.ones(rows.size)
-    # Mostly there is at most one of them.
-    beside = [
-        source
-        for source in (_chord_error(epochs, rows), _wander(epochs, rows, config.monitors), coarse)
-        if source[0].any()
-    ]
-    return AxisSeries(
-        epoch=rows,
-        fresh=fresh,
-        border=np.diff(element, prepend=element[:1]) != 0,
-        dt_s=dt,
-        rate_mps=_steps(position_m[rows]) / dt,
-        **errors_of(sigma_m[rows], dt, beside, config.monitors),
-        white_m2=np.zeros(rows.size),
-        border_m2=2.0 * survey**2,
-        lasting_mps=_turned_mps(epochs, rows) if axis == "cross" else np.zeros((rows.size, 0)),
-    )
-
-
-def _turned_mps(epochs: AlignedEpochs, rows: Ints) -> Floats:
-    """What one sigma along the track makes across it while a curve turns the axes [m/s]; (rows, 1)."""
-    turning = epochs.curvature_per_m[rows] * epochs.speed_mps[rows]
-    return (np.nan_to_num(turning) * epochs.calibrated_along_m[rows])[:, None]
-
-
-def _wander(epochs: AlignedEpochs, rows: Ints, config: MonitorConfig) -> Source:
-    """How the survey's error changes along the elements [m], and its decorrelation over the way of each step.
-
-    A 2-D survey of no stated accuracy wanders; a stated sigma is constant in place, unless configured otherwise.
-    """
-    survey = epochs.survey_sigma_m[rows]
-    unstated = np.isnan(survey) & np.isnan(epochs.vertical_m[rows])
-    stated_m = np.nan_to_num(survey)
-    length_m = config.survey_length_m
-    if length_m is None:
-        stated_m = np.zeros(survey.size)
-        length_m = config.survey_wander_length_m
-    error = np.where(unstated, config.survey_wander_m, stated_m)
-    return error, -np.expm1(-_way_m(epochs, rows) / np.where(unstated, config.survey_wander_length_m, length_m))
-
-
-def _chord_error(epochs: AlignedEpochs, rows: Ints) -> Source:
-    error = np.nan_to_num(epochs.interpolation_error_m[rows])
-    curvature = np.abs(np.nan_to_num(epochs.curvature_per_m[rows]))
-    length = np.sqrt(8.0 * error / np.maximum(curvature, _STRAIGHT_PER_M))  # chord of an arc with this sagitta
-    return error, -np.expm1(-_way_m(epochs, rows) / np.maximum(length, 1.0))
-
-
-def _way_m(epochs: AlignedEpochs, rows: Ints) -> Floats:
-    path_m = np.nan_to_num(epochs.path_m[rows])
-    return np.abs(np.diff(path_m, prepend=path_m[:1]))
-
-
-def _steps(values: Floats) -> Floats:
-    return np.diff(values, prepend=values[:1])
 
 
 NOISE_UNKNOWN = NotEvaluated.NOISE_UNKNOWN
@@ -245,6 +88,7 @@ class AxisBank:
         return int(rows[self._done]) - 1 if self._done < rows.size else self.value.shape[0] - 1
 
     def _store(self, part: AxisSeries, value: Floats, threshold: Floats, noise_m: Floats) -> None:
+        """Write what was evaluated of some rows into the arrays by epoch."""
         present = ~part.fresh[:, None] & self.enabled[None, :]
         # One noise too large, and the axis has a blind spot: none of its monitors says that all is well.
         known: Bools = np.all((noise_m <= self._config.noise_limit_m) | ~self.enabled.any(), axis=1)
@@ -284,12 +128,12 @@ class AxisBank:
         return float(known[-1]) * WHITE_PART if known.size else None
 
     def median_noise_m(self) -> tuple[float, ...]:
-        """By monitor; empty where it never was known."""
+        """Median noise in the thresholds of each monitor [m]; empty where it never was known."""
         known = self.noise_m[np.isfinite(self.noise_m).all(axis=1)]
         return tuple(np.median(known, axis=0).tolist()) if known.size else ()
 
     def verdicts(self) -> dict[str, Verdicts]:
-        """Of the monitors of this axis by name, as far as they are evaluated."""
+        """Verdicts of the monitors of this axis by name, as far as they are evaluated."""
         unknown = np.zeros(self.value.shape[0], dtype=np.bool_)
         unknown[self.series.epoch] = np.isnan(self.noise_m[self.series.epoch]).any(axis=1)
         too_large: Bools = np.any(self.noise_m > self._config.noise_limit_m, axis=1)
@@ -314,9 +158,17 @@ class MonitorBank:
     """The bank as the location determination system sees it: monitors of one solution, from the last restart on.
 
     Epochs are rows of the solution's epochs. Answers for an epoch may change with `freeze` or `restart` at or before
-    it, never through later ones. `single`: monitors without memory. `watched`: epochs with a row along the track. A
-    fail of any monitor is an alarm. `blind_along`: why those along the track cannot say that all is well, if they
-    cannot: an odometer made of the positions agrees with them whatever they say (DOMAIN section 5.0).
+    it, never through later ones. `watched`: epochs with a row along the track. A fail of any monitor is an alarm.
+
+    Args:
+        epochs: aligned epochs of the solution, arrays of shape (n,).
+        single: verdicts of the monitors without memory, by name, each of n rows.
+        config: the configuration.
+        blind_along: why those along the track cannot say that all is well, None where they can: an odometer made of the
+            positions agrees with them whatever they say (DOMAIN section 5.0).
+
+    Source:
+        DIAG eq. 1-17; DOMAIN section 3.
     """
 
     def __init__(
@@ -346,6 +198,7 @@ class MonitorBank:
         self._known_to = -1
 
     def _look(self, epoch: int) -> None:
+        """Evaluate all axes up to this epoch at least, and note what the LDS asks for."""
         if epoch <= self._known_to:
             return
         begin = self._known_to + 1
@@ -358,9 +211,11 @@ class MonitorBank:
         self._along[part] = self._axes[0].state[part, 0] != NOT_EVALUATED
 
     def _look_to_the_end(self) -> None:
+        """Look at all epochs given so far."""
         self._look(self._count - 1)
 
     def failed(self, epoch: int) -> bool:
+        """A monitor of the bank fails at this epoch."""
         self._look(epoch)
         return bool(self._any[epoch])
 
@@ -385,8 +240,16 @@ class MonitorBank:
         first = int(ahead.argmax())
         return epoch + (first if ahead[first] else ahead.size)
 
+    def hidden_until(self, epoch: int, end: int) -> int:
+        """The first epoch from `epoch` on, at most `end`, at which the fast noise is known or something fails."""
+        self._look(epoch)
+        part = slice(epoch, min(self._known_to + 1, end))
+        shown = self._noise_known[part] | self._any[part]
+        first = int(shown.argmax())
+        return epoch + (first if shown[first] else shown.size)
+
     def along_evaluated_between(self, epoch: int, end: int) -> Bools:
-        """Of epochs for which `quiet_until` answered."""
+        """Whether the axis along is evaluated at epochs for which `quiet_until` answered."""
         return self._along[epoch:end]
 
     def noise_known_at(self, epoch: int) -> bool:
@@ -406,6 +269,7 @@ class MonitorBank:
         self._known_to = min(self._known_to, epoch)
 
     def restart(self, epoch: int) -> None:
+        """Begin anew at this epoch, as after a gap: nothing but the measured noise is kept."""
         for axis in self._axes:
             axis.restart(epoch)
         self._known_to = epoch - 1
@@ -426,7 +290,7 @@ class MonitorBank:
         return {name: noise_m for name, noise_m in shown.items() if noise_m}
 
     def verdicts(self) -> dict[str, Verdicts]:
-        """Of each monitor of the bank by name, in the order of the columns of `epochs`."""
+        """Verdicts of each monitor of the bank by name, in the order of the columns of `epochs`."""
         self._look_to_the_end()
         return {name: found for axis in self._axes for name, found in axis.verdicts().items()} | self._single
 

@@ -44,6 +44,7 @@ class NoiseMeter:
         self._entering = [np.arange(samples.row.size) for samples in self._samples]
 
     def freeze(self, row: int) -> None:
+        """No row from this one on enters the noise."""
         for index, samples in enumerate(self._samples):
             entering = self._entering[index]
             self._entering[index] = entering[: np.searchsorted(samples.row[entering], row)]
@@ -171,7 +172,7 @@ class _SecondDifferences:
     span: float
 
     def looked_back(self, entering: Ints, ends: Ints) -> tuple[Floats, Floats, Floats]:
-        """Of the window of counted samples before each of `ends`: M, its relative standard error, the stated variance.
+        """M of the counted samples in a window before each of `ends`, its relative error, the stated variance.
 
         M is the largest over the quantiles; a window still short is filled with -inf, which sorts first.
         """
@@ -196,9 +197,11 @@ class _Triples(NamedTuple):
     oldest: Ints
 
     def where(self, kept: Bools) -> _Triples:
+        """Some of them."""
         return _Triples(*(rows[kept] for rows in self))
 
     def second_difference(self, values: Floats) -> Floats:
+        """x(t) - 2 x(t - L) + x(t - 2 L) of a series."""
         return np.asarray(values[self.last] - 2.0 * values[self.middle] + values[self.oldest])
 
 
@@ -294,16 +297,17 @@ def _lags_s(period_s: float, memories_s: Floats) -> list[float]:
 
 
 def _ratio(part: Floats, whole: Floats) -> Floats:
+    """A part of a whole; 0 where the whole is 0."""
     return np.divide(part, whole, out=np.zeros_like(part), where=whole > 0.0)
 
 
 def _stated_m2(series: AxisSeries, row: Ints, config: MonitorConfig) -> Floats:
-    """Of the Gauss-Markov errors [m^2]."""
+    """Variance of the Gauss-Markov errors [m^2]."""
     return np.asarray((series.sigma_m[row, : error_model(config)[1].size] ** 2).sum(axis=1))
 
 
 def _model_at_m2(series: AxisSeries, row: Ints, lag_s: float, config: MonitorConfig) -> Floats:
-    """Of second differences: smooth errors, and the odometer's walk [m^2]."""
+    """Variance of second differences by the model: smooth errors, and the odometer's walk [m^2]."""
     return _smooth_m2(series, row, lag_s, config) + 2.0 * lag_s * (series.white_m2[row] / series.dt_s[row])
 
 

@@ -76,9 +76,19 @@ _RIDGE = 1e-13
 
 
 def pseudorange_monitor(epochs: MatchedEpochs, satellites: pl.DataFrame | None, config: Configuration) -> Verdicts:
-    """Verdicts, row for row with the matched epochs of one solution.
+    """Ranges to the satellites against the position on the track: the weighted sum of squares of their residuals.
 
-    Value: weighted sum of squares [1]; threshold: its chi-square quantile for the epoch's degrees of freedom.
+    Args:
+        epochs: matched epochs of one solution, arrays of shape (n,).
+        satellites: residuals [m] of its satellites by epoch, or None.
+        config: the configuration; used are `monitors`, `matching` and `fix_sigma`.
+
+    Returns:
+        Verdicts of n rows; value: weighted sum of squares [1], threshold: its chi-square quantile for the epoch's
+        degrees of freedom.
+
+    Source:
+        DO-229 appendix J; DOMAIN section 3.
     """
     if satellites is None or satellites.is_empty():
         return no_verdicts(epochs.height, NO_RANGES)
@@ -92,9 +102,12 @@ def pseudorange_monitor(epochs: MatchedEpochs, satellites: pl.DataFrame | None, 
     tested = freedom > 0
     threshold = np.full(epochs.height, np.nan)
     threshold[tested] = chdtri(freedom[tested], config.monitors.false_alarm_probability)
-    seen = np.isin(np.arange(epochs.height), ranges.epoch)
+    with_ranges = np.isin(np.arange(epochs.height), ranges.epoch)
     reasons = first_reason(
-        (~track.matched, NO_POSITION), (~track.usable, AMBIGUOUS), (~seen, NO_RANGES_AT_EPOCH), (~tested, TOO_FEW)
+        (~track.matched, NO_POSITION),
+        (~track.usable, AMBIGUOUS),
+        (~with_ranges, NO_RANGES_AT_EPOCH),
+        (~tested, TOO_FEW),
     )
     return verdicts(value, threshold, reasons)
 
@@ -111,6 +124,7 @@ class _Ranges:
 
     @property
     def systems(self) -> int:
+        """How many constellations."""
         return int(self.system.max(initial=-1)) + 1
 
 
@@ -128,6 +142,7 @@ class _TrackFrame:
 
 
 def _ranges_by_epoch(epochs: MatchedEpochs, satellites: pl.DataFrame, apart_s: float) -> _Ranges:
+    """Each range with the nearest epoch, no farther from it than `apart_s`."""
     at = pl.DataFrame({"t_ns": epochs.t_ns}).with_row_index("epoch")
     kept = (
         satellites.filter(pl.col("residual_m").is_not_null() & pl.col("used").fill_null(True))
@@ -149,6 +164,7 @@ def _ranges_by_epoch(epochs: MatchedEpochs, satellites: pl.DataFrame, apart_s: f
 
 
 def _track_of(epochs: MatchedEpochs, config: Configuration) -> _TrackFrame:
+    """Direction of the track at each epoch, and the offset of the position from it."""
     cross_m, vertical_m, survey_m = epochs.cross_track_m, epochs.vertical_m, epochs.survey_sigma_m
     angle = np.radians(epochs.heading_deg)
     rise = np.arctan(np.nan_to_num(epochs.slope))
@@ -200,6 +216,7 @@ def equations_of(epochs: MatchedEpochs, satellites: pl.DataFrame, config: Config
 
 
 def _chunks(ranges: _Ranges, track: _TrackFrame) -> Iterator[Equations]:
+    """Equations of usable epochs with ranges, `BLOCK` at a time."""
     usable = np.flatnonzero(track.usable)
     chosen = usable[np.isin(usable, ranges.epoch)]
     for begin in range(0, chosen.size, BLOCK):
@@ -207,6 +224,7 @@ def _chunks(ranges: _Ranges, track: _TrackFrame) -> Iterator[Equations]:
 
 
 def _equations(ranges: _Ranges, track: _TrackFrame, epochs: Ints) -> Equations:
+    """The ranges of these epochs, one slot per satellite; slots of epochs with fewer have weight 0 (not `held`)."""
     first = np.searchsorted(ranges.epoch, epochs)
     count = np.searchsorted(ranges.epoch, epochs, side="right") - first
     slot = np.arange(int(count.max()))
@@ -216,6 +234,7 @@ def _equations(ranges: _Ranges, track: _TrackFrame, epochs: Ints) -> Equations:
     system = ranges.system[place]
     weight = np.where(held, 1.0 / ranges.variance_m2[place], 0.0)
     clocks = (system[:, :, None] == np.arange(ranges.systems)).astype(np.float64)
+    # A receiver's residual is against its own position: moved onto the track by the offset.
     residual = ranges.residual_m[place] + np.einsum("eni,ei->en", rows, track.offset_m[epochs])
     along = np.einsum("eni,ei->en", rows, track.along[epochs])
     cross = np.einsum("eni,ei->en", rows, track.cross[epochs])
@@ -241,11 +260,19 @@ def _left_over(part: Equations) -> Floats:
     """Least weighted sum of squares over the unknowns, priors included."""
     right = np.einsum("eni,en->ei", part.design * part.weight[..., None], part.residual_m)
     solution = np.linalg.solve(normal_of(part.design, part.weight, part.prior), right[..., None])[..., 0]
+    # r' W r - (A' W r)' x, with x of the normal equations N x = A' W r.
     total = np.einsum("en,en->e", part.weight, part.residual_m**2) - np.einsum("ei,ei->e", solution, right)
     return np.asarray(np.maximum(total, 0.0))
 
 
 def normal_of(design: Floats, weight: Floats, prior: Floats) -> Floats:
+    """Normal matrices A' W A + P of some epochs, shape (epochs, unknowns, unknowns).
+
+    Args:
+        design: A, shape (epochs, satellites, unknowns).
+        weight: diagonal of W [1/m^2], shape (epochs, satellites).
+        prior: diagonal of P [1/m^2], shape (epochs, unknowns).
+    """
     normal = np.einsum("eni,enj->eij", design * weight[..., None], design)
     index = np.arange(prior.shape[1])
     normal[:, index, index] += prior

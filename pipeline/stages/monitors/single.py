@@ -26,9 +26,19 @@ NO_OTHER_SOLUTION = NotEvaluated.NO_OTHER_SOLUTION
 
 
 def doppler_monitor(epochs: AlignedEpochs, config: Configuration) -> Verdicts:
-    """GNSS velocity along track against odometer speed, both over the second before [m/s].
+    """GNSS velocity along track against odometer speed, both over the second before.
 
     Separates an odometer fault (slip, slide, radar on wet ground) from one of GNSS positions.
+
+    Args:
+        epochs: aligned epochs of one solution, arrays of shape (n,).
+        config: the configuration; used are `monitors`, `align.speed_window_s` and `scatter_limit_m`.
+
+    Returns:
+        Verdicts of n rows; value and threshold [m/s].
+
+    Source:
+        DOMAIN section 3; ours.
     """
     t_s = (epochs.t_ns - epochs.t_ns[0]) * 1e-9
     velocity_mps = epochs.velocity_along_mps
@@ -37,7 +47,7 @@ def doppler_monitor(epochs: AlignedEpochs, config: Configuration) -> Verdicts:
     coarse = epochs.odometer_rows_m >= config.scatter_limit_m
     usable = np.isfinite(velocity_mps) & (without == NO_REASON) & epochs.fix_valid & ~coarse
     first, span_s = _window(t_s, usable, epochs.odometer_doubt_m, config)
-    doppler_m = np.concatenate([[0.0], np.cumsum(_way(t_s, np.where(usable, velocity_mps, np.nan)))])[:-1]
+    doppler_m = np.concatenate([[0.0], np.cumsum(_trapezoids_m(t_s, np.where(usable, velocity_mps, np.nan)))])[:-1]
     odometer_m = epochs.odometer_m
     value_mps = (doppler_m - doppler_m[first]) / span_s - (odometer_m - odometer_m[first]) / span_s
     sigma_mps = _doppler_sigma(epochs, span_s, velocity_mps - velocity_mps[first], config)
@@ -66,25 +76,31 @@ def _doppler_sigma(epochs: AlignedEpochs, span_s: Floats, change_mps: Floats, co
     return np.sqrt(variance)
 
 
-def channel_monitor(
-    epochs: pl.DataFrame, channel: pl.DataFrame | None, config: Configuration, absent: NotEvaluated = NO_OTHER_SOLUTION
-) -> Verdicts:
-    """Path positions of two solutions at the same time against each other [m] (LOC Fig. 3).
+def channel_monitor(epochs: pl.DataFrame, channel: pl.DataFrame, config: Configuration) -> Verdicts:
+    """Path positions of two solutions at the same time against each other.
 
-    `epochs`: `t, path_m, sigma_along_m, fix_valid, on_track`; `channel`: the same of the other solution, on the same
-    path; its last position since the epoch before counts (`paired`). Errors common to both make the
-    threshold larger than needed. `absent`: the reason where there is no other.
+    The last position of the other since the epoch before counts (`paired`). Errors common to both make the threshold
+    larger than needed.
+
+    Args:
+        epochs: `t, path_m, sigma_along_m, fix_valid, on_track` of this solution, n rows.
+        channel: the same of the other solution, on the same path.
+        config: the configuration; used are `monitors.threshold_factor` and `lds`.
+
+    Returns:
+        Verdicts of n rows; value and threshold [m].
+
+    Source:
+        LOC Fig. 3; DOMAIN section 3.
     """
-    if channel is None:
-        return no_verdicts(epochs.height, absent)
     usable = channel.filter("fix_valid", "on_track")
     own_m = pl.when(pl.col("fix_valid") & pl.col("on_track")).then("path_m")
     pairs = paired(epochs.select("t", path_m=own_m), usable, config.lds)
-    met = usable.select(pl.col("path_m", "sigma_along_m").gather(pairs["row_other"]))
-    value = floats(pairs, "path_m") - floats(met, "path_m")
-    both_m = np.hypot(floats(epochs, "sigma_along_m"), floats(met, "sigma_along_m"))
+    other = usable.select(pl.col("path_m", "sigma_along_m").gather(pairs["row_other"]))
+    value = floats(pairs, "path_m") - floats(other, "path_m")
+    both_m = np.hypot(floats(epochs, "sigma_along_m"), floats(other, "sigma_along_m"))
     placed = truths(epochs["fix_valid"] & epochs["on_track"] & epochs["sigma_along_m"].is_not_null())
-    unknown = truths(met["path_m"].is_null() | met["sigma_along_m"].is_null())
+    unknown = truths(other["path_m"].is_null() | other["sigma_along_m"].is_null())
     reasons = first_reason((~placed, NO_POSITION), (unknown, NotEvaluated.NO_OTHER_EPOCH))
     return verdicts(value, config.monitors.threshold_factor * both_m, reasons)
 
@@ -95,6 +111,7 @@ def _window(
     """Epoch `speed_window_s` before or earlier, and the time since; NaN unless all between is usable and connected."""
     least_s = config.align.speed_window_s * (1.0 - 1e-6)
     first = np.maximum(np.searchsorted(t_s, t_s - least_s, side="right") - 1, 0)
+    # No unusable epoch lies in a window where the running count of them is the same at both ends.
     bad = np.concatenate([[0], np.cumsum(~usable)])
     clean = bad[np.arange(t_s.size) + 1] == bad[first]
     span = t_s - t_s[first]
@@ -103,8 +120,8 @@ def _window(
     return first, np.where(connected, span, np.nan)
 
 
-def _way(t_s: Floats, velocity: Floats) -> Floats:
-    """By trapezoids [m], zero where a velocity is missing."""
+def _trapezoids_m(t_s: Floats, velocity: Floats) -> Floats:
+    """Distances by trapezoids of the speeds [m], zero where a velocity is missing."""
     steps = 0.5 * (velocity[1:] + velocity[:-1]) * np.diff(t_s)
     return np.concatenate([np.nan_to_num(steps), [0.0]])
 
@@ -143,7 +160,7 @@ def on_path_of(epochs: pl.DataFrame, channel: pl.DataFrame, lds: LdsConfig) -> p
 
 
 def paired(epochs: pl.DataFrame, channel: pl.DataFrame, lds: LdsConfig) -> pl.DataFrame:
-    """For each epoch: `row_other`, the last row of `channel` since the epoch before, and this solution's `path_m` then.
+    """The last row of `channel` since the epoch before, `row_other`, and this solution's `path_m` then, per epoch.
 
     That is the epoch's own, or between this epoch and the one before, if a movement is interpolated over that; else
     null.
@@ -153,15 +170,16 @@ def paired(epochs: pl.DataFrame, channel: pl.DataFrame, lds: LdsConfig) -> pl.Da
     since = pl.col("t_ns") - pl.col("t_ns").shift(1)
     early = pl.col("t_ns") - pl.col("t_other")
     between = (early < since) & (since <= pl.col("gap_ns"))
-    way = (pl.col("path_m") - pl.col("path_m").shift(1)) * (early / since)
+    moved_m = (pl.col("path_m") - pl.col("path_m").shift(1)) * (early / since)
     return (
         mine.join_asof(stamps, left_on="t_ns", right_on="t_other", strategy="backward")
-        .with_columns(path_m=pl.when(early == 0).then("path_m").when(between).then(pl.col("path_m") - way))
+        .with_columns(path_m=pl.when(early == 0).then("path_m").when(between).then(pl.col("path_m") - moved_m))
         .select("path_m", row_other=pl.when(pl.col("path_m").is_not_null()).then("row_other"))
     )
 
 
 def _stamp() -> pl.Expr:
+    """Times as whole nanoseconds."""
     return pl.col("t").to_physical()
 
 
@@ -169,6 +187,7 @@ def _with_sense(epochs: pl.DataFrame) -> pl.DataFrame:
     """Places with `sense`: +1 where the path runs with the measure, -1 against it; 0 where a visit has not shown it."""
     path, measure = (pl.col(name).diff().over("visit") for name in ("path_m", "measure_m"))
     placed = epochs.select(*_PLACE, t_ns=_stamp(), visit=pl.col("netelement_id").rle_id())
+    # Steps along path and measure have equal signs where both grow or both fall.
     moved = (path * measure).fill_null(0.0).cum_sum().over("visit")
     return placed.select("t_ns", *_PLACE, sense=moved.sign().cast(pl.Int8))
 
@@ -185,8 +204,12 @@ class MonitorInput:
 
 
 WITHOUT_MEMORY: Mapping[str, Callable[[MonitorInput], Verdicts]] = {
-    "along_doppler": lambda seen: doppler_monitor(seen.epochs, seen.config),
-    "channel": lambda seen: channel_monitor(seen.epochs.table, seen.other, seen.config, seen.absent),
-    "pseudorange": lambda seen: pseudorange_monitor(seen.epochs, seen.satellites, seen.config),
+    "along_doppler": lambda given: doppler_monitor(given.epochs, given.config),
+    "channel": lambda given: (
+        no_verdicts(given.epochs.height, given.absent)
+        if given.other is None
+        else channel_monitor(given.epochs.table, given.other, given.config)
+    ),
+    "pseudorange": lambda given: pseudorange_monitor(given.epochs, given.satellites, given.config),
 }
 """Monitors by the name that `schemas.tables.ALL_MONITORS` gives them."""

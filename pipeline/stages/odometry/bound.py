@@ -1,7 +1,7 @@
 """Steps of a counter that no train drives: where the distance leaps, stalls, or was set to another value.
 
-A step is odd where its speed differs from that of the step beside it by more than a train brakes or accelerates and
-rows scatter. A run is consecutive odd steps; the mean speed beside it says how far the train drove meanwhile, within
+A step is odd where its speed differs from that of the neighbouring step by more than a train brakes or accelerates and
+rows scatter. A run is consecutive odd steps; the mean speed around it says how far the train drove meanwhile, within
 G(T), for a run of T seconds: b T^2 / 4 by the speeds at its ends, and b T w / 2 as the mean over w on either side
 stands for them, where the acceleration changes from +b to -b just there.
 """
@@ -30,9 +30,9 @@ LOST_M = 1e6
 
 
 class OddRun(NamedTuple):
-    """Rows `first` to `last`; counted way [m]; mean speed beside it [m/s], NaN where one side has none.
+    """Rows `first` to `last`; counted distance [m]; mean speed around it [m/s], NaN where one side has none.
 
-    `off_m`: by how much the train may have driven another way than was counted.
+    `off_m`: by how much the train may have driven another distance than was counted.
     """
 
     first: int
@@ -61,20 +61,27 @@ class _CounterRows(NamedTuple):
 
 
 def driven_within_m(time_s: float, config: AlignConfig, about_s: float | None = None) -> float:
-    """G(T) [m]: how far the way in `time_s` may be from the mean speed over `about_s` beside it."""
-    about_s = beside_s(time_s, config) if about_s is None else about_s
+    """G(T) [m]: how far the distance run in `time_s` may be from the mean speed over `about_s` around it."""
+    about_s = window_around_s(time_s, config) if about_s is None else about_s
     return 0.25 * config.braking_mps2 * time_s**2 + 0.5 * config.braking_mps2 * time_s * about_s
 
 
-def beside_s(time_s: float, config: AlignConfig) -> float:
-    """Over how long the mean speed on either side is taken, w [s]; rounded stamps take in the row at its edge."""
+def window_around_s(time_s: float, config: AlignConfig) -> float:
+    """Time over which the mean speed on either side is taken, w [s]; rounded stamps take in the row at its edge."""
     return config.speed_window_s + 0.5 * time_s
 
 
 def odd_runs(t_s: Floats, distance_m: Floats, counts_m: Floats | float, config: AlignConfig) -> OddRuns:
-    """Of rows at these times [s], NaN where not recorded.
+    """Runs of rows in which the counter leapt, stalled or was set, by how it counts elsewhere.
 
-    `counts_m`: the step of the counter as known at each row, 0 where none is.
+    Args:
+        t_s: times of the rows [s], shape (n,).
+        distance_m: what the counter shows [m], NaN where not recorded, shape (n,).
+        counts_m: step of the counter as known at each row [m], 0 where none is, shape (n,) or one for all.
+        config: the section `align` of the configuration.
+
+    Returns:
+        Runs of rows that are odd, and those near enough to odd that a small leap may hide in them.
     """
     rows = np.flatnonzero(np.isfinite(distance_m))
     if rows.size < 3:
@@ -89,7 +96,7 @@ def odd_runs(t_s: Floats, distance_m: Floats, counts_m: Floats | float, config: 
     stalls, near_stalls = _stalls(counted, config)
     odd = _between_places(leaps, t_s.size, config) | stalls | _too_far(t_s, distance_m, config)
     odd |= _set_in_a_hole(counted, stalls, config)
-    close = _between_places(leaps | near, t_s.size, config) | _beside_lone(leaps | near, t_s.size, config)
+    close = _between_places(leaps | near, t_s.size, config) | _around_lone(leaps | near, t_s.size, config)
     close = (close | near_stalls) & ~odd
     found = _runs(counted, odd, odd, config)
     small = _runs(counted, close, odd, config)
@@ -97,6 +104,7 @@ def odd_runs(t_s: Floats, distance_m: Floats, counts_m: Floats | float, config: 
 
 
 def _in_all_rows(run: OddRun, rows: Ints) -> OddRun:
+    """The run with its rows counted among all rows, not only those with a distance."""
     return run._replace(first=int(rows[run.first]), last=int(rows[run.last]))
 
 
@@ -128,12 +136,15 @@ def _by_stamps_m(t_s: Floats, distance_m: Floats) -> Floats:
 
 
 def _running_median(values: Floats, window: int) -> Floats:
-    """Of the values up to each."""
+    """Median of the values up to each."""
     return pl.Series(values).rolling_median(window, min_samples=1).to_numpy().copy()
 
 
 def _periods_s(t_s: Floats, config: AlignConfig) -> Floats:
-    """Mean of the steps before each, pauses cut short: a median would be that within a bunch."""
+    """Mean period of the rows before each step [s], pauses cut short.
+
+    A median would be the period within a bunch of rows that arrive together.
+    """
     means = pl.Series(np.minimum(np.diff(t_s), config.odometer_gap_s)).rolling_mean(_PERIOD_ROWS, min_samples=1)
     means_s = means.to_numpy()
     return np.concatenate([means_s[:1], means_s[:-1]])
@@ -144,6 +155,7 @@ def _places(counted: _CounterRows, config: AlignConfig) -> tuple[Bools, Bools]:
     dt_s = np.diff(counted.t_s)
     speed_mps = np.diff(counted.distance_m) / dt_s
     least_s = np.minimum(dt_s[1:], dt_s[:-1])
+    # Beyond what braking explains: |dv| T - b (T1 + T2) / 2 T, T the shorter of both steps.
     apart_m = np.abs(np.diff(speed_mps)) * least_s - 0.5 * config.braking_mps2 * (dt_s[1:] + dt_s[:-1]) * least_s
     bunched = least_s < 0.5 * _periods_s(counted.t_s, config)[1:]
     rows_m = 2.0 * counted.counts_m[1:-1] + config.sure_sigmas * counted.scatter_m
@@ -170,8 +182,8 @@ def _between_places(places: Bools, size: int, config: AlignConfig) -> Bools:
     return odd
 
 
-def _beside_lone(places: Bools, size: int, config: AlignConfig) -> Bools:
-    """Both steps beside places that have no other one near."""
+def _around_lone(places: Bools, size: int, config: AlignConfig) -> Bools:
+    """Both steps next to places that have no other one near."""
     odd = np.zeros(size - 1, dtype=np.bool_)
     rows = np.flatnonzero(places)
     away = np.diff(rows, prepend=-config.leap_steps, append=size + config.leap_steps) >= config.leap_steps
@@ -198,12 +210,12 @@ def _stalls(counted: _CounterRows, config: AlignConfig) -> tuple[Bools, Bools]:
     for begin, last in spans_of(repeats):
         end = last + 1
         time_s = float(t_s[end] - t_s[begin])
-        about_s = beside_s(time_s, config)
-        # Less beside it may be a single count.
+        about_s = window_around_s(time_s, config)
+        # Less around it may be a single count.
         if t_s[begin] - about_s < t_s[0] or t_s[end] + about_s > t_s[-1]:
             continue
-        beside = sums.beside(t_s, begin, end, config)
-        missing_m = abs(beside.mean_mps) * time_s - driven_within_m(time_s, config, beside.about_s)
+        around = sums.speeds_around(t_s, begin, end, config)
+        missing_m = abs(around.mean_mps) * time_s - driven_within_m(time_s, config, around.about_s)
         counts_m = float(counted.counts_m[begin])
         scatter_m = config.sure_sigmas * float(counted.scatter_m[end - 1])
         stalls[begin : end + 1] = missing_m > config.leap_m + 2.0 * counts_m + scatter_m
@@ -212,18 +224,18 @@ def _stalls(counted: _CounterRows, config: AlignConfig) -> tuple[Bools, Bools]:
 
 
 def _set_in_a_hole(counted: _CounterRows, odd: Bools, config: AlignConfig) -> Bools:
-    """Steps over missing rows: the short step beside one shows little of a leap in it."""
+    """Steps over missing rows: the short step next to one shows little of a leap in it."""
     t_s, distance_m = counted.t_s, counted.distance_m
     dt_s = np.diff(t_s)
     period_s = _periods_s(t_s, config)
     bunched = dt_s < 0.5 * period_s
-    beside = bunched | np.append(bunched[1:], False) | np.append([False], bunched[:-1])
-    hole = (dt_s > config.odometer_gap_periods * period_s) & (dt_s <= config.odometer_gap_s) & ~(odd | beside)
+    next_to_bunched = bunched | np.append(bunched[1:], False) | np.append([False], bunched[:-1])
+    hole = (dt_s > config.odometer_gap_periods * period_s) & (dt_s <= config.odometer_gap_s) & ~(odd | next_to_bunched)
     sums = _Sums.of(t_s, distance_m, odd | hole)
     found = np.zeros(dt_s.size, dtype=np.bool_)
     for step in np.flatnonzero(hole).tolist():
         time_s = float(dt_s[step])
-        around = sums.beside(t_s, step, step + 1, config)
+        around = sums.speeds_around(t_s, step, step + 1, config)
         off_m = abs(distance_m[step + 1] - distance_m[step] - around.mean_mps * time_s)
         scatter_m = config.sure_sigmas * float(counted.scatter_m[min(step, counted.scatter_m.size - 1)])
         within_m = driven_within_m(time_s, config, around.about_s)
@@ -231,7 +243,7 @@ def _set_in_a_hole(counted: _CounterRows, odd: Bools, config: AlignConfig) -> Bo
     return found
 
 
-class _Beside(NamedTuple):
+class _SpeedsAround(NamedTuple):
     """Mean speeds before and after [m/s], NaN where no step counts there; over how long [s]."""
 
     before_mps: float
@@ -245,39 +257,41 @@ class _Beside(NamedTuple):
 
 
 class _Sums(NamedTuple):
-    """Way [m] and time [s] up to each row of the steps that count."""
+    """Distance [m] and time [s] up to each row of the steps that count."""
 
-    way_m: Floats
+    distance_m: Floats
     time_s: Floats
 
     @classmethod
     def of(cls, t_s: Floats, distance_m: Floats, left_out: Bools) -> _Sums:
-        ways, times = (
+        """The bound over all steps but those left out."""
+        distances, times = (
             np.concatenate([[0.0], np.cumsum(np.where(left_out, 0.0, np.diff(values)))]) for values in (distance_m, t_s)
         )
-        return cls(ways, times)
+        return cls(distances, times)
 
-    def beside(self, t_s: Floats, first: int, last: int, config: AlignConfig) -> _Beside:
+    def speeds_around(self, t_s: Floats, first: int, last: int, config: AlignConfig) -> _SpeedsAround:
         """What the train drove before `first` and after `last`."""
-        about_s = beside_s(float(t_s[last] - t_s[first]), config)
+        about_s = window_around_s(float(t_s[last] - t_s[first]), config)
         begin = max(min(int(np.searchsorted(t_s, t_s[first] - about_s)), first - 1), 0)
         end = min(max(int(np.searchsorted(t_s, t_s[last] + about_s, side="right")) - 1, last + 1), t_s.size - 1)
         about_s = max(about_s, 0.5 * float(t_s[first] - t_s[begin] + t_s[end] - t_s[last]))
-        return _Beside(self._mean_mps(begin, first), self._mean_mps(last, end), about_s)
+        return _SpeedsAround(self._mean_mps(begin, first), self._mean_mps(last, end), about_s)
 
     def _mean_mps(self, begin: int, end: int) -> float:
+        """Mean speed over the steps that count between two rows; NaN without any."""
         time_s = float(self.time_s[end] - self.time_s[begin])
-        return float(self.way_m[end] - self.way_m[begin]) / time_s if time_s > 0.0 else float("nan")
+        return float(self.distance_m[end] - self.distance_m[begin]) / time_s if time_s > 0.0 else float("nan")
 
 
 def weighed(t_s: Floats, distance_m: Floats, steps: Bools, config: AlignConfig) -> list[OddRun]:
-    """Each run of these steps (pauses, slip) by the mean speed beside it."""
+    """Each run of these steps (pauses, slip) by the mean speed around it."""
     counted = _CounterRows(t_s, distance_m, np.zeros(t_s.size), np.zeros(max(t_s.size - 2, 1)))
     return _runs(counted, steps, steps, config)
 
 
 def _runs(counted: _CounterRows, steps: Bools, left_out: Bools, config: AlignConfig) -> list[OddRun]:
-    """Runs of `steps`; speeds beside them are taken of steps that are neither in `steps` nor in `left_out`."""
+    """Runs of `steps`; speeds around them are taken of steps that are neither in `steps` nor in `left_out`."""
     if not steps.any():
         return []
     t_s, distance_m = counted.t_s, counted.distance_m
@@ -287,10 +301,10 @@ def _runs(counted: _CounterRows, steps: Bools, left_out: Bools, config: AlignCon
         last = last_step + 1
         time_s = float(t_s[last] - t_s[first])
         counted_m = float(distance_m[last] - distance_m[first])
-        before_mps, after_mps, about_s = beside = sums.beside(t_s, first, last, config)
-        mean_mps = beside.mean_mps
+        before_mps, after_mps, about_s = around = sums.speeds_around(t_s, first, last, config)
+        mean_mps = around.mean_mps
         one_sided = np.isnan(mean_mps)
-        # At an end of the recording one side tells the way alone: b T^2 / 4 more.
+        # At an end of the recording one side alone gives the distance: b T^2 / 4 more.
         within_m = driven_within_m(time_s, config, about_s)
         within_m += 0.25 * config.braking_mps2 * time_s**2 if one_sided else 0.0
         about_mps = float(np.fmin(before_mps, after_mps)) if one_sided else mean_mps
@@ -316,8 +330,8 @@ def is_lost(doubt_m: Floats) -> Bools:
 class Bound:
     """Sums over runs of steps whose count may be off, per row at `t_s` [m].
 
-    `begun_m`: of the runs that began before a row; `ended_m`: of those that ended by it. A way that touches a run has
-    all of its bound, as its error may have arisen at any place in it.
+    `begun_m`: of the runs that began before a row; `ended_m`: of those that ended by it. A movement that touches a run
+    has all of its bound, as its error may have arisen at any place in it.
     """
 
     t_s: Floats
@@ -330,6 +344,7 @@ class Bound:
     ) -> Bound:
         """All per step: `doubtful` by leaps, stalls, pauses, slip, speeds; `lost`, not known at all; by `least_m`."""
         begun_m, ended_m = np.zeros((2, t_s.size))
+        # Number of losses before each step.
         gone = np.concatenate([[0], np.cumsum(lost)])
         for run in weighed(t_s, distance_m, doubtful | lost, config):
             off_m = max(run.off_m, float(least_m[run.first : run.last].sum()))
@@ -339,14 +354,14 @@ class Bound:
         return cls(t_s, np.cumsum(begun_m), np.cumsum(ended_m))
 
     def between_m(self, begin_s: Floats, end_s: Floats) -> Floats:
-        """Of the ways between instants, in either order; lost outside the recording."""
+        """Bound of the movements between instants [m], in either order; lost outside the recording."""
         first_s, last_s = np.minimum(begin_s, end_s), np.maximum(begin_s, end_s)
         before = np.searchsorted(self.t_s, first_s, side="right") - 1
         after = np.searchsorted(self.t_s, last_s, side="left")
         inside = (before >= 0) & (after < self.t_s.size)
         size = self.t_s.size - 1
         between_m = self.begun_m[np.minimum(after, size)] - self.ended_m[np.maximum(before, 0)]
-        # An instant at a row has neither of the steps beside it: no way.
+        # An instant at a row has neither of the steps next to it: no movement.
         return np.where(inside, np.where(last_s > first_s, np.maximum(between_m, 0.0), 0.0), LOST_M)
 
 
@@ -365,11 +380,22 @@ class RecoveryRule:
         return self.config.hazards.limits.relink_m
 
     def is_quiet(self, quiet_s: float | Floats) -> Bools:
+        """No fast monitor failed for `lds.recovery_s`; `quiet_s`: time since the last fast failure [s]."""
         return np.asarray(quiet_s) >= self.config.lds.recovery_s
 
-    def variance_m2(self, positions_m2: Number, elapsed_s: Number, way_m: Number, sigma_scale: float) -> Number:
-        """What GNSS minus odometer moves by without a fault [m^2]; `positions_m2`: variances of both positions."""
-        return positions_m2 + self.config.monitors.odometer_sigma_mps**2 * elapsed_s + (sigma_scale * way_m) ** 2
+    def variance_m2(self, positions_m2: Number, elapsed_s: Number, distance_m: Number, sigma_scale: float) -> Number:
+        """What GNSS minus odometer moves by without a fault.
+
+        Args:
+            positions_m2: sum of the variances of both positions [m^2].
+            elapsed_s: time between them [s].
+            distance_m: distance run between them [m].
+            sigma_scale: standard deviation of the odometer scale [1].
+
+        Returns:
+            Variance [m^2], of the shape of the arguments.
+        """
+        return positions_m2 + self.config.monitors.odometer_sigma_mps**2 * elapsed_s + (sigma_scale * distance_m) ** 2
 
     def bound_m(self, variance_m2: float | Floats) -> Floats:
         """min(failure limit / 2, k_T sqrt(variance)) [m]."""

@@ -55,7 +55,7 @@ def with_hysteresis(distance_m: Floats, width_m: Floats) -> Floats:
 
 
 def _row_by_row(at_m: float, least_m: Floats, most_m: Floats) -> list[float]:
-    """Where movements to and fro are shorter than a block is worth."""
+    """The distance with hysteresis row by row, where movements to and fro are shorter than a block is worth."""
     values = []
     for low_m, high_m in zip(least_m.tolist(), most_m.tolist(), strict=True):
         at_m = min(max(at_m, low_m), high_m)
@@ -68,19 +68,19 @@ def turns_of(distance_m: Floats, back_m: float) -> list[tuple[int, int, int]]:
     turns: list[tuple[int, int, int]] = []
     start, sense = 0, 1
     while start < distance_m.size:
-        way_m = sense * distance_m[start:]
-        came_back_m = np.maximum.accumulate(way_m) - way_m
-        seen = int(np.argmax(came_back_m >= back_m))
-        if came_back_m[seen] < back_m:
+        ahead_m = sense * distance_m[start:]
+        came_back_m = np.maximum.accumulate(ahead_m) - ahead_m
+        row = int(np.argmax(came_back_m >= back_m))
+        if came_back_m[row] < back_m:
             break
         sense = -sense
-        turns.append((start + int(np.argmax(way_m[: seen + 1])), start + seen, sense))
-        start += seen
+        turns.append((start + int(np.argmax(ahead_m[: row + 1])), start + row, sense))
+        start += row
     return turns
 
 
 def travelled_m(t_s: Floats, distance_m: Floats, width_m: Floats, deadband_mps: float, window_s: float) -> Floats:
-    """Way driven up to each row, to and fro [m]; of a stand only the farthest it was from its place.
+    """Distance driven up to each row, to and fro [m]; of a stand only the farthest it was from its place.
 
     `width_m`: of the hysteresis that takes the noise of rows away, infinite where it is not known yet.
     """
@@ -92,19 +92,19 @@ def travelled_m(t_s: Floats, distance_m: Floats, width_m: Floats, deadband_mps: 
     # Before a turn the held distance lags behind, after it too (`with_hysteresis`): both were driven all the same.
     lags_m = np.zeros(held_m.size)
     lags_m[moves[1:][turned] + 1] = width_m[moves[:-1][turned] + 1] + width_m[moves[1:][turned] + 1]
-    # While it is not known how wide the hysteresis is, the way is that from the place held.
+    # While it is not known how wide the hysteresis is, the distance is that from the place held.
     away_m = np.where(np.isinf(width_m), np.abs(distance_m - held_m), 0.0)
     return np.asarray(np.maximum.accumulate(driven + np.cumsum(lags_m) + away_m))
 
 
-def under_way(t_s: Floats, way_m: Floats, deadband_mps: float, window_s: float) -> Bools:
+def is_moving(t_s: Floats, driven_m: Floats, deadband_mps: float, window_s: float) -> Bools:
     """Whether more was driven over the window before each time than the dead band."""
-    moving: Bools = way_m - np.interp(t_s - window_s, t_s, way_m) > deadband_mps * window_s
+    moving: Bools = driven_m - np.interp(t_s - window_s, t_s, driven_m) > deadband_mps * window_s
     return moving
 
 
 def moving_steps(t_s: Floats, distance_m: Floats, deadband_mps: float, window_s: float) -> Bools:
-    """Per step between samples: mean speed beyond the dead band, over `window_s` at least, centred on the step."""
+    """Mean speed of each step beyond the dead band, over `window_s` at least, centred on the step."""
     half_s = 0.5 * np.maximum(np.diff(t_s), window_s)
     centre_s = 0.5 * (t_s[1:] + t_s[:-1])
     begin_m, end_m = (np.interp(at_s, t_s, distance_m) for at_s in (centre_s - half_s, centre_s + half_s))
@@ -113,8 +113,10 @@ def moving_steps(t_s: Floats, distance_m: Floats, deadband_mps: float, window_s:
 
 
 def driven_or_left_m(distance_m: Floats, moving: Bools) -> Floats:
-    """Way driven up to each sample [m]; of a stand only the farthest it was from its place, as noise would add up."""
-    way_m = np.abs(np.diff(distance_m))
+    """Distance driven up to each sample [m]; of a stand only the farthest it was from its place, as noise would add
+    up.
+    """
+    step_m = np.abs(np.diff(distance_m))
     first = np.flatnonzero(np.diff(moving, prepend=~moving[:1]))
     lengths = np.diff(first, append=moving.size)
     span = np.repeat(np.arange(first.size), lengths)  # of steps that all move, or all stand
@@ -125,7 +127,7 @@ def driven_or_left_m(distance_m: Floats, moving: Bools) -> Floats:
     begins = np.zeros(moving.size, dtype=np.bool_)
     begins[first] = True
     left_m = np.where(begins, farthest_m, np.diff(farthest_m, prepend=0.0))
-    return np.concatenate([[0.0], np.cumsum(np.where(moving, way_m, left_m))])
+    return np.concatenate([[0.0], np.cumsum(np.where(moving, step_m, left_m))])
 
 
 def evenly_driven(
@@ -133,21 +135,21 @@ def evenly_driven(
 ) -> tuple[Floats, Floats]:
     """Support points (times, distances [m]) of a distance without quantisation noise, linear between; not causal.
 
-    The rows that move the held distance; where the way to the next is slower than `least_mps` the train stood, and the
-    last row near the place of the stand, from which it departs, is one more.
+    The rows that move the held distance; where the movement to the next is slower than `least_mps` the train stood, and
+    the last row near the place of the stand, from which it departs, is one more.
     """
     width_m = hysteresis_m(sigma_m, config)
     steps = np.diff(with_hysteresis(distance_m, width_m), prepend=np.nan)
     # A hysteresis that narrows with the speed moves the held distance too: only rows that move themselves count.
     moves = np.flatnonzero((steps != 0) & (np.diff(distance_m, prepend=np.nan) != 0))
     elapsed_s = np.diff(t_s[moves])
-    way_m = np.abs(np.diff(distance_m[moves]))
-    # At a turn, and at first, the hysteresis delays the row by twice the width: the way to it is longer by that.
+    step_m = np.abs(np.diff(distance_m[moves]))
+    # At a turn, and at first, the hysteresis delays the row by twice the width: the movement to it is longer by that.
     turned = steps[moves[1:]] * np.nan_to_num(steps[moves[:-1]]) <= 0
-    stood = way_m - np.where(turned, 2.0 * width_m[moves[1:]], 0.0) <= least_mps * elapsed_s
+    at_standstill = step_m - np.where(turned, 2.0 * width_m[moves[1:]], 0.0) <= least_mps * elapsed_s
     points = list(zip(t_s[moves].tolist(), distance_m[moves].tolist(), strict=True))
     # From the last stand to the first, so that the places of those before stay where they are in the list.
-    for gap in np.flatnonzero(stood & (elapsed_s > 0))[::-1].tolist():
+    for gap in np.flatnonzero(at_standstill & (elapsed_s > 0))[::-1].tolist():
         between = slice(int(moves[gap]), int(moves[gap + 1]))
         points.insert(gap + 1, _departure(t_s[between], distance_m[between], sigma_m[between]))
     points.append((float(t_s[-1]), points[-1][1]))

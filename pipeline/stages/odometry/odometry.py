@@ -17,17 +17,16 @@ from pipeline.stages.odometry.rows import (
     StepDistances,
     contradicted_by_speeds,
     count_step,
+    declared_mps,
     declared_origin,
     filled_in,
-    ways_between,
+    slips_of,
+    step_distances,
 )
-from schemas.arrays import NS_PER_S, Bools, Floats, Ints, floats, median, times_ns, truths
+from schemas.arrays import NS_PER_S, Bools, Floats, Ints, floats, median, times_ns
 from schemas.config import AlignConfig, Configuration, Vehicle
 from schemas.enums import Origin
 from schemas.frozen import frozen
-
-# Numerics: of so many rows the declared sigma is usual.
-_DECLARED_ROWS = 100
 
 
 class OdometerDistance(NamedTuple):
@@ -92,10 +91,12 @@ class Odometry:
 
     @property
     def begin_ns(self) -> int:
+        """The first row."""
         return self.epoch_ns
 
     @property
     def end_ns(self) -> int:
+        """The last row, rounded up."""
         return self.epoch_ns + int(np.ceil(self.t_s[-1] * 1e9))
 
     def oriented(self, sign: int) -> Odometry:
@@ -103,13 +104,15 @@ class Odometry:
         return self if sign > 0 else replace(self, distance_m=-self.distance_m)
 
     def seconds(self, t_ns: Ints) -> Floats:
+        """Instants [ns] as seconds since `epoch_ns`."""
         return ((t_ns - self.epoch_ns) * 1e-9).astype(np.float64)
 
     def known_at(self, t_ns: Ints) -> Bools:
+        """Whether the distance is known at instants [ns], as `known_at_s`."""
         return self.known_at_s(self.seconds(t_ns))
 
     def slips_at_s(self, t_s: Floats) -> Bools:
-        """By the sample before or after."""
+        """Whether the sample before or after is slip."""
         return self._slips_between(*self._around(t_s))
 
     def doubt_at_s(self, t_s: Floats) -> Floats:
@@ -117,15 +120,16 @@ class Odometry:
         return np.interp(t_s, self.t_s, self.doubt_m)
 
     def distance_at(self, t_ns: Ints) -> Floats:
-        """As recorded [m]; NaN where it is not known."""
+        """Distance as recorded at instants [m]; NaN where it is not known."""
         t_s = self.seconds(t_ns)
         return np.where(self.known_at_s(t_s), self.distance_at_s(t_s), np.nan)
 
     def travelled_at(self, t_ns: Ints) -> Floats:
-        """Way driven since the first row [m], to and fro; interpolated over gaps."""
+        """Distance driven since the first row [m], to and fro; interpolated over gaps."""
         return np.interp(self.seconds(t_ns), self.t_s, self._travelled_m)
 
     def moving_s_at(self, t_ns: Ints) -> Floats:
+        """Time for which the train moved since the first row [s]."""
         return np.interp(self.seconds(t_ns), *self._moving_s)
 
     def moved(self, t_ns: Ints) -> Bools:
@@ -136,12 +140,13 @@ class Odometry:
         """Whether the train is farther from its place than dead band and noise; not where that is in doubt."""
         return np.abs(np.nan_to_num(self.proved_between(begin_ns, end_ns))) > self._still_m(begin_ns, end_ns) + noise_m
 
-    def stood(self, begin_ns: Ints | int, end_ns: Ints) -> Bools:
+    def was_at_standstill(self, begin_ns: Ints | int, end_ns: Ints) -> Bools:
         """Whether it is no farther from its place than the dead band; not where that is in doubt."""
-        stood: Bools = np.abs(self.proved_between(begin_ns, end_ns)) <= self._still_m(begin_ns, end_ns)
-        return stood
+        still: Bools = np.abs(self.proved_between(begin_ns, end_ns)) <= self._still_m(begin_ns, end_ns)
+        return still
 
     def _still_m(self, begin_ns: Ints | int, end_ns: Ints) -> Floats:
+        """What a wheel may move unnoticed in a time, below the speed that counts as standstill [m]."""
         return np.asarray(self.deadband_mps * np.abs(end_ns - begin_ns) / NS_PER_S)
 
     def between(self, begin_ns: Ints | int, end_ns: Ints) -> OdometerDistance:
@@ -150,6 +155,13 @@ class Odometry:
         s D, and s^2 (white noise over the time in which the train moved, quantisation noise of both rows) + (sigma_s
         D)^2 (DOMAIN section 5.1). NaN outside the recording and where the distance was lost in between; else off by
         `bound_m` besides.
+
+        Args:
+            begin_ns: instants from which, one or as many as `end_ns` [ns].
+            end_ns: instants to which [ns], shape (n,).
+
+        Returns:
+            Signed distances, variances and bounds, shape (n,).
         """
         scale = self.scale or 1.0
         scale_sigma = self.scale_sigma or 0.0
@@ -165,7 +177,7 @@ class Odometry:
         return OdometerDistance(scale * recorded, variance, bound_m)
 
     def bound_between_m(self, begin_ns: Ints | int, end_ns: Ints) -> Floats:
-        """By how much the way between instants may be off, as braking and acceleration prove it [m]."""
+        """How much the distance between instants may be off, as braking and acceleration prove it [m]."""
         begin_ns = np.broadcast_to(begin_ns, end_ns.shape)
         if self.bound is None:
             return np.zeros(end_ns.size)
@@ -187,8 +199,9 @@ class Odometry:
         return self.proved_between(t_ns[:-1], t_ns[1:])
 
     def _counted_between(self, begin_ns: Ints, end_ns: Ints, sure: Bools) -> Floats:
-        way_m = self.distance_at(end_ns) - self.distance_at(begin_ns)
-        return np.asarray((self.scale or 1.0) * np.where(sure, way_m, np.nan))
+        """Recorded distance between instants, scaled [m]; NaN where not `sure`."""
+        moved_m = self.distance_at(end_ns) - self.distance_at(begin_ns)
+        return np.asarray((self.scale or 1.0) * np.where(sure, moved_m, np.nan))
 
     def increments(self, t_ns: Ints, scale: Floats, latency_s: Floats) -> Increments:
         """Both ends of a step with the scale and latency in use at the later one."""
@@ -197,7 +210,7 @@ class Odometry:
         return Increments(distance, scale * (self.speed_at_s(now) - self.speed_at_s(before)))
 
     def driven(self, t_ns: Ints, scale: Floats, latency_s: Floats) -> Floats:
-        """Way driven between consecutive instants, to and fro [m]."""
+        """Distance driven between consecutive instants, to and fro [m]."""
         begin_m, end_m = (np.interp(at_s, self.t_s, self._travelled_m) for at_s in self._steps_s(t_ns, latency_s))
         return np.asarray(scale * (end_m - begin_m))
 
@@ -215,6 +228,7 @@ class Odometry:
         return white
 
     def bridged_m2_at(self, t_s: Floats) -> Floats:
+        """Sum of the variances over bridged resets up to each instant [m^2]."""
         return np.zeros(t_s.size) if self.bridged_m2 is None else np.interp(t_s, self.t_s, self.bridged_m2)
 
     def known_at_s(self, t_s: Floats) -> Bools:
@@ -244,10 +258,11 @@ class Odometry:
         return np.asarray((self.scale or 1.0) * moved_m / np.maximum(end_s - begin_s, 1e-9))
 
     def noise_at_s(self, t_s: Floats) -> KnownNoise:
+        """The noise as the rows up to each instant show it."""
         return self.known_noise.at(self._sample_at(t_s))
 
     def known_row_sigma_m(self, t_s: Floats) -> Floats:
-        """Of the rows' noise, as known at these instants [m]."""
+        """Sigma of the rows' noise, as known at these instants [m]."""
         return np.sqrt(self.noise_at_s(t_s).row_m2(self.speed_at_s(t_s)))
 
     def hysteresis_m(self, t_s: Floats) -> Floats:
@@ -258,26 +273,30 @@ class Odometry:
         return np.where(self.noise_at_s(t_s).shown, hysteresis_m(self.known_row_sigma_m(t_s), self.config), np.inf)
 
     def row_sigma_m(self, t_s: Floats) -> Floats:
-        """Of the rows' noise, as the run shows it [m]."""
+        """Sigma of the rows' noise, as the run shows it [m]."""
         if not self.noise.quantisation:
             return np.zeros(t_s.size)
         return np.sqrt(self.noise.quantisation.variance_m2(self.speed_at_s(t_s)))
 
     def _sample_at(self, t_s: Floats) -> Ints:
+        """The last sample not after each instant; the first one before the recording."""
         index: Ints = np.searchsorted(self.t_s, t_s, side="right") - 1
         return index.clip(0, self.t_s.size - 1)
 
     def _slips_between(self, before: Ints, after: Ints) -> Bools:
+        """Whether a wheel slipped at either of two rows."""
         slips: Bools = self.slip[before] | self.slip[after]
         return slips
 
     def _around(self, t_s: Floats) -> tuple[Ints, Ints]:
+        """Samples before and after each instant; twice the same at a sample."""
         after = np.searchsorted(self.t_s, t_s, side="left").clip(0, self.t_s.size - 1)
         before = np.where(self.t_s[after] == t_s, after, np.maximum(after - 1, 0))
         return before, after
 
     @cached_property
     def _moving_s(self) -> tuple[Floats, Floats]:
+        """Times, and for how long the train has moved up to each [s]."""
         at_s = self.t_s
         at_m = self.distance_m
         if self.noise.quantisation:
@@ -287,16 +306,28 @@ class Odometry:
 
     @cached_property
     def _travelled_m(self) -> Floats:
+        """Distance travelled at each row, whichever way the train went [m]."""
         width_m = self.hysteresis_m(self.t_s)
         return travelled_m(self.t_s, self.distance_m, width_m, self.deadband_mps, self.config.speed_window_s)
 
 
 def odometry_of(stream: pl.DataFrame | None, vehicle: Vehicle, config: Configuration) -> Odometry | None:
-    """The odometer of a cleaned stream, as recorded; None without at least two rows.
+    """The odometer of a cleaned stream, as recorded.
 
-    In doubt are pauses beyond `odometer_gap_s` without a counter and slip that the odometer reports; lost is the way
-    over a leap or pause that nothing bridges. White noise is `odometer_sigma_mps`, or a larger declared
+    In doubt are pauses beyond `odometer_gap_s` without a counter and slip that the odometer reports; lost is the
+    distance over a leap or pause that nothing bridges. White noise is `odometer_sigma_mps`, or a larger declared
     `sigma_speed_mps`, taken as independent from row to row.
+
+    Args:
+        stream: the stream `odometer` of one sensor, cleaned, shape (n,); or None.
+        vehicle: odometer scale and origin, as far as the file gives them.
+        config: the configuration; used are `align`, `matching.deadband_mps` and `monitors.odometer_sigma_mps`.
+
+    Returns:
+        The odometer; None without at least two rows.
+
+    Source:
+        DOMAIN sections 3 (noise) and 5.1 (bounds).
     """
     if stream is None or stream.height < 2:
         return None
@@ -309,25 +340,27 @@ def odometry_of(stream: pl.DataFrame | None, vehicle: Vehicle, config: Configura
     period_s = row_periods_s(t_ns)
     limit_s = np.maximum(align.odometer_gap_s, align.odometer_gap_periods * period_s[1:])
     counts = count_step(distance_m, align)
-    ways = ways_between(t_s, distance_m, speed, counts.step_m, limit_s, align)
-    way_m, counted, bridged_m = ways.way_m, ways.counted, ways.bridged_m
-    unknown = np.isnan(way_m)
+    distances = step_distances(t_s, distance_m, speed, counts.step_m, limit_s, align)
+    moved_m, counted, bridged_m = distances.moved_m, distances.counted, distances.bridged_m
+    unknown = np.isnan(moved_m)
     pause = unknown | (dt_s > limit_s)
-    slip = _slips(stream, align)
-    silent = pause & ~counted
-    lost = silent | slip[1:]
-    guessed = silent & ~unknown
-    guess_m, guess_doubt_m = _guessed_ways(way_m, dt_s, speed, period_s[1:], config)
-    way_m = np.where(guessed, guess_m, way_m)
-    distance_m = _sums(np.where(unknown, 0.0, way_m))
+    slip = slips_of(stream, align)
+    uncounted_pause = pause & ~counted
+    lost = uncounted_pause | slip[1:]
+    guessed = uncounted_pause & ~unknown
+    guess_m, guess_doubt_m = _guessed_distances(moved_m, dt_s, speed, period_s[1:], config)
+    moved_m = np.where(guessed, guess_m, moved_m)
+    distance_m = _sums(np.where(unknown, 0.0, moved_m))
     whole = counted & ~lost & ~pause
-    noise, known_noise = noise_of_rows(t_s, distance_m, whole, counts, period_s, _declared_mps(stream), config)
-    parts = _contradicted(t_s, distance_m, ways, known_noise, config)
+    noise, known_noise = noise_of_rows(t_s, distance_m, whole, counts, period_s, declared_mps(stream), config)
+    parts = _contradicted(t_s, distance_m, distances, known_noise, config)
     doubt_m = _slip_doubt_m(np.diff(distance_m), dt_s, slip, floats(stream, "sigma_speed_mps"), align)
     doubt_m += np.where(guessed, guess_doubt_m, parts.doubt_m)
-    doubt_m = _sums(np.where(silent & unknown, LOST_M, doubt_m))
-    doubtful = ways.odd | pause | slip[:-1] | slip[1:] | parts.steps
-    bound = Bound.of(t_s, distance_m, doubtful, silent & unknown, parts.off_m, align) if doubtful.any() else None
+    doubt_m = _sums(np.where(uncounted_pause & unknown, LOST_M, doubt_m))
+    doubtful = distances.odd | pause | slip[:-1] | slip[1:] | parts.steps
+    bound = (
+        Bound.of(t_s, distance_m, doubtful, uncounted_pause & unknown, parts.off_m, align) if doubtful.any() else None
+    )
     apart = np.flatnonzero((dt_s > align.straight_s) & ~pause & ~lost & ~slip[:-1])
     row_s = t_s
     if apart.size:
@@ -350,7 +383,7 @@ def odometry_of(stream: pl.DataFrame | None, vehicle: Vehicle, config: Configura
         period_s=median(dt_s),
         scale=vehicle.odometer_scale if in_file else None,
         scale_sigma=vehicle.odometer_scale_sigma if in_file else None,
-        leaps_ns=tuple(t_ns[list(ways.resets)].tolist()),
+        leaps_ns=tuple(t_ns[list(distances.resets)].tolist()),
         bridged_m2=np.interp(t_s, row_s, _sums(bridged_m**2)) if bridged_m.any() else None,
         bound=bound,
         config=align,
@@ -359,56 +392,47 @@ def odometry_of(stream: pl.DataFrame | None, vehicle: Vehicle, config: Configura
 
 
 def _contradicted(
-    t_s: Floats, distance_m: Floats, ways: StepDistances, noise: KnownNoise, config: Configuration
+    t_s: Floats, distance_m: Floats, distances: StepDistances, noise: KnownNoise, config: Configuration
 ) -> Contradiction:
-    """Where the speeds contradict the counted distance beyond the noise of its rows, at their speed by the distance."""
+    """Whether the speeds contradict the counted distance beyond the noise of its rows."""
     align = config.align
     begin_s = np.maximum(t_s - align.speed_window_s, t_s[0])
     speed_mps = (distance_m - np.interp(begin_s, t_s, distance_m)) / np.maximum(t_s - begin_s, 1e-9)
     rows_m = align.sure_sigmas * np.sqrt(2.0 * noise.row_m2(speed_mps))
-    recorded_m = np.where(ways.counted & ~ways.odd, ways.way_m, np.nan)
-    return contradicted_by_speeds(t_s, recorded_m, ways.driven_m, rows_m, config.matching.deadband_mps, align)
+    recorded_m = np.where(distances.counted & ~distances.odd, distances.moved_m, np.nan)
+    return contradicted_by_speeds(t_s, recorded_m, distances.driven_m, rows_m, config.matching.deadband_mps, align)
 
 
-def _guessed_ways(
-    way_m: Floats, dt_s: Floats, speed_mps: Floats, period_s: Floats, config: Configuration
+def _guessed_distances(
+    moved_m: Floats, dt_s: Floats, speed_mps: Floats, period_s: Floats, config: Configuration
 ) -> tuple[Floats, Floats]:
-    """The way over a pause of speeds at each step, and by how much it may be off [m].
+    """The distance over a pause of speeds at each step, and by how much it may be off [m].
 
-    Mean speed x dt (`way_m`), with acceleration and braking up to b. But some loggers write nothing at a stand: where
+    Mean speed x dt (`moved_m`), with acceleration and braking up to b. But some loggers write nothing at a stand: where
     the train stands at one row and at the other is no faster than it gets in a period, it drove for a period before and
-    after at most. Half of that is the way; it may have stood then, or gone on at the slower speed.
+    after at most. Half of that is the distance; it may have stood then, or gone on at the slower speed.
     """
     deadband_mps = config.matching.deadband_mps
     braking_mps2 = config.align.braking_mps2
     slower_mps, faster_mps = np.sort(np.abs([speed_mps[:-1], speed_mps[1:]]), axis=0)
-    stood = (slower_mps <= deadband_mps) & (faster_mps <= deadband_mps + braking_mps2 * period_s)
+    at_standstill = (slower_mps <= deadband_mps) & (faster_mps <= deadband_mps + braking_mps2 * period_s)
     stand_m = 0.5 * period_s * (speed_mps[:-1] + speed_mps[1:])
     stand_doubt_m = 0.5 * period_s * (slower_mps + faster_mps) + slower_mps * dt_s
-    return np.where(stood, stand_m, way_m), np.where(stood, stand_doubt_m, 0.25 * braking_mps2 * dt_s**2)
+    return np.where(at_standstill, stand_m, moved_m), np.where(
+        at_standstill, stand_doubt_m, 0.25 * braking_mps2 * dt_s**2
+    )
 
 
-def _slips(stream: pl.DataFrame, config: AlignConfig) -> Bools:
-    """By the flag, or by a sigma of the speed beyond any use."""
-    slips: Bools = truths(stream["slip"]) | (floats(stream, "sigma_speed_mps") > config.slip_sigma_mps)
-    return slips
-
-
-def _slip_doubt_m(way_m: Floats, dt_s: Floats, slip: Bools, sigma_mps: Floats, config: AlignConfig) -> Floats:
-    """By how much the count of each step into, in or out of slip may be off [m].
+def _slip_doubt_m(moved_m: Floats, dt_s: Floats, slip: Bools, sigma_mps: Floats, config: AlignConfig) -> Floats:
+    """How much the count of each step into, in or out of slip may be off [m].
 
     A share of the step, or its reported sigma times dt: the error lasts while it slips. A locked wheel counts nothing.
     """
     sigma_mps = np.nan_to_num(np.fmax(sigma_mps[1:], sigma_mps[:-1]))
-    doubt_m = np.maximum(np.maximum(config.slip_way_share * np.abs(way_m), sigma_mps * dt_s), LEAST_DOUBT_M)
+    doubt_m = np.maximum(np.maximum(config.slip_way_share * np.abs(moved_m), sigma_mps * dt_s), LEAST_DOUBT_M)
     return np.where(slip[1:] | slip[:-1], doubt_m, 0.0)
 
 
-def _declared_mps(stream: pl.DataFrame) -> Floats:
-    """The usual sigma of the speed as declared up to each row [m/s]; NaN where none is."""
-    declared = stream["sigma_speed_mps"].cast(pl.Float64)
-    return declared.rolling_median(_DECLARED_ROWS, min_samples=1).to_numpy()
-
-
 def _sums(steps: Floats) -> Floats:
+    """Running sum of steps from 0 on, shape (n,) to (n + 1,)."""
     return np.concatenate([[0.0], np.cumsum(steps)])

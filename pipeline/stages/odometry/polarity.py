@@ -1,4 +1,4 @@
-"""The way over slip as another odometer of the train counted it."""
+"""The distance over slip as another odometer of the train counted it."""
 
 from __future__ import annotations
 
@@ -18,8 +18,17 @@ def counted_over_slip(
 ) -> Odometry:
     """The distance over each step of slip by the first other odometer that counted it.
 
-    Slip stays reported, but only `other_way_share` of the way is in doubt. Others may count the other way round, as the
-    first `orientation_m` show.
+    Slip stays reported, but only `other_way_share` of the step is in doubt. Others may count with the other sign, as
+    the first `orientation_m` show.
+
+    Args:
+        odometry: the odometer of the LDS.
+        others: the other independent odometers, in order of preference.
+        orientation_m: distance over which the sign of another one is found [m].
+        config: the section `align` of the configuration.
+
+    Returns:
+        The odometer, with the distances over slip replaced.
     """
     if not others or not odometry.slip.any():
         return odometry
@@ -30,7 +39,7 @@ def counted_over_slip(
     for odometer in others:
         counted_m = np.diff(odometer.distance_at(t_ns))
         counts = open_steps & np.isfinite(counted_m) & (np.diff(odometer.doubt_at_s(odometer.seconds(t_ns))) == 0.0)
-        sense = sense_of_ways(own_m, counted_m, orientation_m)
+        sense = relative_sense(own_m, counted_m, orientation_m)
         step_m[counts] = sense * counted_m[counts] / (odometry.scale or 1.0)
         doubt_m[counts] = np.maximum(config.other_way_share * np.abs(step_m[counts]), LEAST_DOUBT_M)
         open_steps &= ~counts
@@ -38,6 +47,7 @@ def counted_over_slip(
 
 
 def _sums(steps: Floats) -> Floats:
+    """Running sum of steps from 0 on, shape (n,) to (n + 1,)."""
     return np.concatenate([[0.0], np.cumsum(steps)])
 
 
@@ -52,27 +62,27 @@ def polarity(odometry: Odometry, t_ns: Ints, path_m: Floats, distance_m: float) 
         return 1
     odometer = recorded_m[usable]
     path = path_m[usable]
-    way = np.maximum.accumulate(np.abs(odometer - odometer[0]))
-    window = int(np.searchsorted(way, 4.0 * distance_m)) + 1
+    travelled_m = np.maximum.accumulate(np.abs(odometer - odometer[0]))
+    window = int(np.searchsorted(travelled_m, 4.0 * distance_m)) + 1
     # By metres, not by rows: a long stand before the departure has one vote, not thousands.
-    starts = np.unique(np.searchsorted(way, np.arange(0.0, 2.0 * distance_m)))
-    starts = starts[starts < min(window, way.size)]
+    starts = np.unique(np.searchsorted(travelled_m, np.arange(0.0, 2.0 * distance_m)))
+    starts = starts[starts < min(window, travelled_m.size)]
     votes = [_side(odometer[start:window], path[start:window], distance_m) for start in starts]
     return -1 if sum(votes) < 0 else 1
 
 
-def shared_ways_m(counted_m: Floats, other_m: Floats) -> Floats:
-    """Of two recorders' ways over the same times what both moved, negative where in opposite senses [m].
+def shared_movement_m(counted_m: Floats, other_m: Floats) -> Floats:
+    """What two recorders both moved over the same times [m], negative where in opposite senses.
 
-    The noise of one that stands has no direction to give to a way that the other counts.
+    The noise of one that stands has no direction to give to a movement that the other counts.
     """
     shared: Floats = np.sign(counted_m * other_m) * np.minimum(np.abs(counted_m), np.abs(other_m))
     return np.nan_to_num(shared)
 
 
-def sense_of_ways(counted_m: Floats, other_m: Floats, distance_m: float) -> int:
-    """+1 or -1: which way one counts against the other, by the first `distance_m` that both moved, or by all."""
-    moved_m = np.cumsum(shared_ways_m(counted_m, other_m))
+def relative_sense(counted_m: Floats, other_m: Floats, distance_m: float) -> int:
+    """+1 or -1: the sign of one counter against the other, by the first `distance_m` that both moved, or by all."""
+    moved_m = np.cumsum(shared_movement_m(counted_m, other_m))
     if not moved_m.size:
         return 1
     first = np.flatnonzero(np.abs(moved_m) >= distance_m)
@@ -80,7 +90,7 @@ def sense_of_ways(counted_m: Floats, other_m: Floats, distance_m: float) -> int:
 
 
 def grows_with(position_m: Floats, t_ns: Ints, odometry: Odometry | None, distance_m: float) -> bool:
-    """Whether these positions grew over the first `distance_m` of net movement: which way the path is to grow.
+    """Whether these positions grew over the first `distance_m` of net movement: in which direction the path is to grow.
 
     By the odometer where there is one, as votes: its sign against them (`polarity`) and its own movement. A question
     about the path, not about the counter; without an odometer the positions alone answer it.
@@ -102,7 +112,7 @@ def grows_with(position_m: Floats, t_ns: Ints, odometry: Odometry | None, distan
 
 
 def _side(odometer: Floats, path: Floats, distance_m: float) -> int:
-    """Whether path and odometer go the same way (1), opposite ways (-1) or nowhere (0)."""
+    """Whether path and odometer grow in the same direction (1), in opposite ones (-1) or nowhere (0)."""
     moved = odometer - odometer[0]
     far = np.flatnonzero(np.abs(moved) >= distance_m)
     end = int(far[0]) if far.size else int(np.argmax(np.abs(moved)))

@@ -39,10 +39,11 @@ class QuantisationNoise:
     moving_s2: float = 0.0
 
     def variance_m2(self, speed_mps: Floats) -> Floats:
+        """Variance of a row at these speeds."""
         return self.still_m2 + self.moving_s2 * speed_mps**2
 
     def of_counter(self, counter_m: float) -> QuantisationNoise:
-        """At least that of its step, which does not show at one speed."""
+        """The scatter, at least that of the counter's step, which does not show at one speed."""
         return QuantisationNoise(max(self.still_m2, counter_m**2 / 12.0), self.moving_s2)
 
     def __bool__(self) -> bool:
@@ -63,6 +64,7 @@ class ScatterPieces(NamedTuple):
     explained_m2: Floats
 
     def take(self, pieces: Ints | slice) -> ScatterPieces:
+        """Some of the pieces."""
         return ScatterPieces(
             self.end[pieces], self.speed_mps[pieces], self.scatter_m2[pieces], self.explained_m2[pieces]
         )
@@ -77,16 +79,16 @@ def scatter_pieces(
     deadband_mps: float,
     config: AlignConfig,
 ) -> ScatterPieces:
-    """`whole` (rows - 1,): ways that are recorded; `period_s` of the rows and their white noise, as known at each."""
+    """`whole` (rows - 1,): steps that are recorded; `period_s` of the rows and their white noise, as known at each."""
     shape = _moving_pieces(t_s, distance_m, whole, period_s, deadband_mps, config)
     pieces = ScatterPieces(shape.end, *np.zeros((3, shape.end.size)))
     for count in np.unique(shape.rows).tolist():
         of_count = np.flatnonzero(shape.rows == count)
         rows = shape.begin[of_count, None] + shape.stride[of_count, None] * np.arange(count)
         since_s = t_s[rows] - t_s[rows[:, :1]]
-        ways = distance_m[rows] - distance_m[rows[:, :1]]
-        pieces.speed_mps[of_count] = np.abs(ways[:, -1]) / since_s[:, -1]
-        scatter_m2, walked_s = _scatter(since_s, ways)
+        moved_m = distance_m[rows] - distance_m[rows[:, :1]]
+        pieces.speed_mps[of_count] = np.abs(moved_m[:, -1]) / since_s[:, -1]
+        scatter_m2, walked_s = _scatter(since_s, moved_m)
         pieces.scatter_m2[of_count] = scatter_m2
         pieces.explained_m2[of_count] = white_m2_per_s[shape.end[of_count]] * walked_s
     return pieces
@@ -101,19 +103,22 @@ def of_the_run(pieces: ScatterPieces, config: AlignConfig) -> QuantisationNoise:
 class KnownScatter(NamedTuple):
     """Per row the terms of `QuantisationNoise`; `shown`: enough pieces before it show them.
 
-    `seen_mps`: the one speed at which they do, infinite where they tell noise of the stamps from that of the reading.
+    `shown_mps`: the one speed at which they do, infinite where noise of the stamps and of the reading are told apart.
     """
 
     still_m2: Floats
     moving_s2: Floats
-    seen_mps: Floats
+    shown_mps: Floats
     shown: Bools
 
 
 def known_at_rows(
     pieces: ScatterPieces, first_m2: Floats, renewal_s: float, t_s: Floats, config: AlignConfig
 ) -> KnownScatter:
-    """As the last pieces before each row show it; `first_m2`: of each row until there are enough of them."""
+    """The scatter at each row, as the last pieces before it show it.
+
+    `first_m2`: the scatter [m^2] of each row until there are enough pieces.
+    """
     size = t_s.size
     known = KnownScatter(first_m2.copy(), np.zeros(size), np.full(size, np.inf), np.zeros(size, dtype=np.bool_))
     renewed_s = -np.inf
@@ -121,7 +126,7 @@ def known_at_rows(
         if number >= _FEWEST_PIECES and t_s[end] - renewed_s >= renewal_s:
             last = pieces.take(slice(max(number - _PIECES, 0), number))
             found = _fit(last, config)
-            known.seen_mps[end:] = np.inf if _speeds(last, config).differ else median(last.speed_mps)
+            known.shown_mps[end:] = np.inf if _speeds(last, config).differ else median(last.speed_mps)
             known.still_m2[end:] = found.still_m2
             known.moving_s2[end:] = found.moving_s2
             known.shown[end:] = True
@@ -132,7 +137,7 @@ def known_at_rows(
 def first_scatter_m2(
     t_s: Floats, distance_m: Floats, period_s: Floats, white_m2_per_s: Floats, config: AlignConfig
 ) -> Floats:
-    """Variance of a row [m^2] by the rows up to each: how far each lies beside the straight line of its neighbours.
+    """Variance of a row [m^2] by the rows up to each: how far each lies off the straight line through its neighbours.
 
     Less the same of the row before, which constant braking leaves as it is: noise of rows has 5 sigma^2 of that, white
     noise of the increments 1.5 r dt. A median of few is uncertain: by 3 / root of their number more.
@@ -140,8 +145,8 @@ def first_scatter_m2(
     if t_s.size < 4:
         return np.zeros(t_s.size)
     share = np.diff(t_s)[:-1] / np.maximum(t_s[2:] - t_s[:-2], 1e-9)
-    beside_m = distance_m[1:-1] - distance_m[:-2] - share * (distance_m[2:] - distance_m[:-2])
-    changes_m = np.abs(np.diff(beside_m))
+    off_line_m = distance_m[1:-1] - distance_m[:-2] - share * (distance_m[2:] - distance_m[:-2])
+    changes_m = np.abs(np.diff(off_line_m))
     median_m = pl.Series(changes_m).rolling_median(_FIRST_ROWS, min_samples=_FEWEST_FIRST).fill_null(0.0).to_numpy()
     count = np.minimum(np.arange(1, changes_m.size + 1), _FIRST_ROWS)
     sigma_m = median_m / _MEDIAN_SIGMAS * (1.0 + 3.0 / np.sqrt(count))
@@ -178,6 +183,7 @@ class _Speeds(NamedTuple):
 
 
 def _speeds(pieces: ScatterPieces, config: AlignConfig) -> _Speeds:
+    """Which pieces are faster than the median, and whether both halves differ enough to tell."""
     fast: Bools = pieces.speed_mps > median(pieces.speed_mps)
     low_mps, high_mps = (median(pieces.speed_mps[part]) if part.any() else 0.0 for part in (~fast, fast))
     differ = bool(fast.sum() >= _FEWEST_PIECES) and high_mps**2 >= config.quantisation_factor * low_mps**2
@@ -222,13 +228,13 @@ def _moving_pieces(
     return _Shapes(chosen, ends[chosen], counts[chosen], strides[chosen])
 
 
-def _scatter(since_s: Floats, way_m: Floats) -> tuple[Floats, Floats]:
+def _scatter(since_s: Floats, moved_m: Floats) -> tuple[Floats, Floats]:
     """Variance about the curves [m^2] of each piece, and what white noise of the increments of 1 m^2/s makes of it."""
     count = since_s.shape[1]
     powers = (2.0 * since_s / since_s[:, -1:] - 1.0)[:, :, None] ** np.arange(_DEGREE + 1)
     curves, _ = np.linalg.qr(powers)
-    fitted = curves @ (curves.transpose(0, 2, 1) @ way_m[:, :, None])
-    scatter = ((way_m - fitted[:, :, 0]) ** 2).sum(axis=1)
+    fitted = curves @ (curves.transpose(0, 2, 1) @ moved_m[:, :, None])
+    scatter = ((moved_m - fitted[:, :, 0]) ** 2).sum(axis=1)
     walk = np.minimum(since_s[:, :, None], since_s[:, None, :])
     left = since_s.sum(axis=1) - (curves * (walk @ curves)).sum(axis=(1, 2))
     free = count - _DEGREE - 1
@@ -257,23 +263,24 @@ class KnownNoise:
     """The same as the rows up to each sample show it, and the period of the rows [s].
 
     `still_m2`, `moving_s2`: of `QuantisationNoise`; a first figure where too few rows show them yet (not `shown`). What
-    shows at one speed may be noise of the stamps: beyond `seen_mps` it grows by `faster_s2` with the speed squared.
+    shows at one speed may be noise of the stamps: beyond `shown_mps` it grows by `faster_s2` with the speed squared.
     """
 
     white_m2_per_s: Floats
     still_m2: Floats
     moving_s2: Floats
     faster_s2: Floats
-    seen_mps: Floats
+    shown_mps: Floats
     period_s: Floats
     shown: Bools
 
     def at(self, samples: Ints) -> KnownNoise:
+        """The scatter at some of the samples."""
         return KnownNoise(*(getattr(self, each.name)[samples] for each in fields(self)))
 
     def row_m2(self, speed_mps: Floats) -> Floats:
         """Variance of a row [m^2]."""
-        faster = np.maximum(speed_mps**2 - self.seen_mps**2, 0.0)
+        faster = np.maximum(speed_mps**2 - self.shown_mps**2, 0.0)
         return np.asarray(self.still_m2 + self.moving_s2 * speed_mps**2 + self.faster_s2 * faster)
 
 
@@ -315,8 +322,8 @@ def noise_of_rows(
         still_m2=np.maximum(known.still_m2, counts.step_m**2 / 12.0),
         moving_s2=known.moving_s2,
         # Twice what the counts explain are still the counts.
-        faster_s2=np.maximum(known.still_m2 - counts.step_m**2 / 6.0, 0.0) / known.seen_mps**2,
-        seen_mps=known.seen_mps,
+        faster_s2=np.maximum(known.still_m2 - counts.step_m**2 / 6.0, 0.0) / known.shown_mps**2,
+        shown_mps=known.shown_mps,
         period_s=period_s,
         shown=known.shown | none | counts.shown,
     )

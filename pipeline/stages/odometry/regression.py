@@ -1,4 +1,4 @@
-"""Robust regression of ways on ways: scale, lag, and how sure both are."""
+"""Robust regression of movements on movements: scale, lag, and how sure both are."""
 
 from __future__ import annotations
 
@@ -14,13 +14,14 @@ from schemas.frozen import frozen
 _MAD = 1.4826
 # A change of speed, as a share of the usual one.
 _CHANGES = 0.5
-# So many lengths of a way are left out to see how much depends on them.
+# So many lengths of a movement are left out to see how much depends on them.
 _LEFT_OUT = 6
 # Numerics: with less independent information about scale and lag, as a share of the whole, they are not told apart.
 _LEAST_INDEPENDENT = 1e-12
-# Noise is correlated over so many lengths of a way, beyond those that overlap.
+# Noise is correlated over so many lengths of a movement, beyond those that overlap.
 _MEMORY = 10
-# Changes of speed, and ways, are more than noise by so many sigmas; far lags are worse than the one found by so many.
+# Changes of speed, and movements, are more than noise by so many sigmas; far lags are worse than the one found by so
+# many.
 SHOWN, WORSE = 6.0, 3.0
 
 
@@ -35,10 +36,10 @@ class LagState(StrEnum):
 
 @frozen
 class ScaleLag:
-    """Way of the other recorder over that counted; stamp of a moment by the other minus the counter's [s].
+    """Movement of the other recorder over that counted; stamp of a moment by the other minus the counter's [s].
 
-    Standard deviations beside them, infinite where a figure is not measured: 4 of them hold whatever the noise is like.
-    `halves`: scale and lag of the first and the second half of the run alone.
+    Standard deviations next to them, infinite where a figure is not measured: 4 of them hold whatever the noise is
+    like. `halves`: scale and lag of the first and the second half of the run alone.
     """
 
     scale: float = 1.0
@@ -50,16 +51,20 @@ class ScaleLag:
 
     @property
     def measured(self) -> bool:
+        """Both scale and lag are known."""
         return self.state is LagState.MEASURED
 
 
 @frozen
 class Regression:
-    """way = design @ (scale, scale * rest of the lag), by the moments of `beside`, over the `used` ways."""
+    """movement = design @ (scale, scale * rest of the lag), by instrumental variables, over the `used` movements.
+
+    `instruments`: the same columns from other rows of the counter, so that their noise is not that of `design`.
+    """
 
     design: Floats
-    beside: Floats
-    way_m: Floats
+    instruments: Floats
+    moved_m: Floats
     used: Bools
     overlap: int
 
@@ -79,24 +84,26 @@ class Regression:
         )
 
     def with_sigmas(self, parts: slice) -> list[float]:
-        """Each part of the estimate, and its sigma: the largest of several ways to look at the noise."""
-        design, beside = (values[:, parts] * self.used[:, None] for values in (self.design, self.beside))
-        inverse = np.linalg.inv(beside.T @ design)
-        theta = inverse @ (beside.T @ self.way_m)
-        left = np.where(self.used, self.way_m - design @ theta, 0.0)
-        spreads = [_spread(beside, left, self.used, reach) for reach in (self.overlap, _MEMORY * self.overlap)]
+        """Each part of the estimate, and its sigma: the largest of several estimates of the noise."""
+        design, instruments = (values[:, parts] * self.used[:, None] for values in (self.design, self.instruments))
+        inverse = np.linalg.inv(instruments.T @ design)
+        # Instrumental variables: theta = (Z' X)^-1 Z' y; its covariance (Z' X)^-1 S (Z' X)^-T, S that of Z' e.
+        theta = inverse @ (instruments.T @ self.moved_m)
+        left = np.where(self.used, self.moved_m - design @ theta, 0.0)
+        spreads = [_spread(instruments, left, self.used, reach) for reach in (self.overlap, _MEMORY * self.overlap)]
         variances = np.max([np.diag(inverse @ one @ inverse.T) for one in spreads], axis=0)
         sigmas = student_factor(self.used.sum() / self.overlap - 2.0) * np.sqrt(np.maximum(variances, 0.0))
-        sigmas = np.maximum(sigmas, self._without_one(design, beside, theta))
+        sigmas = np.maximum(sigmas, self._without_one(design, instruments, theta))
         return [float(value) for pair in zip(theta, sigmas, strict=True) for value in pair]
 
-    def _without_one(self, design: Floats, beside: Floats, theta: Floats) -> Floats:
-        """By how much each part of the estimate changes at most without a change of speed, a minute, a quarter.
+    def _without_one(self, design: Floats, instruments: Floats, theta: Floats) -> Floats:
+        """Largest change of each part of the estimate without one change of speed, one minute, one quarter.
 
         One change of speed alone looks like a step or drift of the other recorder, or a slip, that came with it and
         may last as long.
         """
-        moments = beside[:, :, None] * np.concatenate([design, self.way_m[:, None]], axis=1)[:, None, :]
+        moments = instruments[:, :, None] * np.concatenate([design, self.moved_m[:, None]], axis=1)[:, None, :]
+        # Sums up to each row: what any stretch contributes is the difference of two of them.
         sums = np.cumsum(np.concatenate([np.zeros((1, *moments.shape[1:])), moments]), axis=0)
         reach = max(self.overlap + 1, min(_LEFT_OUT * self.overlap, len(design) // 4))
         begin = np.arange(len(design) - reach + 1)
@@ -116,7 +123,7 @@ class Regression:
         Where the speed changes by less than half as much as it does usually it does not change.
         """
         used = np.flatnonzero(self.used)
-        change = self.beside[used, 1]
+        change = self.instruments[used, 1]
         usual = float(np.sqrt(np.mean(change[change != 0.0] ** 2)))
         rows = np.flatnonzero(np.abs(change) > _CHANGES * usual)
         other = (np.diff(rows) > self.overlap) | (np.diff(np.sign(change[rows])) != 0.0)
@@ -125,20 +132,20 @@ class Regression:
 
     def _changes_show(self) -> bool:
         """Two figures of each change of speed, by other rows, have in common more than their noise would by chance."""
-        if _alike_columns(self.beside[self.used].T @ self.design[self.used]):
+        if _alike_columns(self.instruments[self.used].T @ self.design[self.used]):
             return False
-        near, beside = self.design[self.used, 1], self.beside[self.used, 1]
-        noise = 0.5 * float(((near - beside) ** 2).sum()) / np.sqrt(near.size / self.overlap)
-        return bool(near @ beside > SHOWN * noise)
+        near, instruments = self.design[self.used, 1], self.instruments[self.used, 1]
+        noise = 0.5 * float(((near - instruments) ** 2).sum()) / np.sqrt(near.size / self.overlap)
+        return bool(near @ instruments > SHOWN * noise)
 
     def halves(self, assumed_s: float, parts: slice = slice(None)) -> tuple[tuple[float, float], ...]:
-        """Scale and lag by the first and by the second half of the ways."""
+        """Scale and lag by the first and by the second half of the movements."""
         rows = np.flatnonzero(self.used)
         found = []
         for half in (rows[: rows.size // 2], rows[rows.size // 2 :]):
-            design, beside = self.design[half, parts], self.beside[half, parts]
-            if not _alike_columns(beside.T @ design):
-                scale, *rest = np.linalg.solve(beside.T @ design, beside.T @ self.way_m[half]).tolist()
+            design, instruments = self.design[half, parts], self.instruments[half, parts]
+            if not _alike_columns(instruments.T @ design):
+                scale, *rest = np.linalg.solve(instruments.T @ design, instruments.T @ self.moved_m[half]).tolist()
                 found.append((scale, assumed_s + (rest[0] / scale if rest and scale else 0.0)))
         return tuple(found)
 
@@ -148,23 +155,23 @@ def half_apart(halves: Sequence[tuple[float, float]]) -> float:
     return 0.5 * abs(halves[0][0] - halves[1][0]) if len(halves) == 2 else float("inf")
 
 
-def solved_moments(design: Floats, beside: Floats, way_m: Floats) -> Floats:
+def solved_moments(design: Floats, instruments: Floats, moved_m: Floats) -> Floats:
     """Scale and scale * lag; the scale alone where nothing tells the lag."""
-    normal = beside.T @ design
+    normal = instruments.T @ design
     if _alike_columns(normal):
-        return np.array([float(design[:, 0] @ way_m / (design[:, 0] @ design[:, 0])), 0.0])
-    return np.asarray(np.linalg.solve(normal, beside.T @ way_m))
+        return np.array([float(design[:, 0] @ moved_m / (design[:, 0] @ design[:, 0])), 0.0])
+    return np.asarray(np.linalg.solve(normal, instruments.T @ moved_m))
 
 
-def has_enough_ways(values: Floats) -> Bools:
-    """Lags (rows) at which at least half as many ways are known as at any."""
+def has_enough_movements(values: Floats) -> Bools:
+    """Lags (rows) at which at least half as many movements are known as at any."""
     counts = np.isfinite(values).sum(axis=1)
     enough: Bools = counts >= max(0.5 * counts.max(initial=0), 3)
     return enough
 
 
 def _alike_columns(normal: Floats) -> bool:
-    """Ways and changes of speed are proportional, or there are no changes: nothing tells the two apart."""
+    """Movements and changes of speed are proportional, or there are no changes: nothing tells the two apart."""
     return bool(abs(np.linalg.det(normal)) <= _LEAST_INDEPENDENT * abs(float(np.prod(np.diag(normal)))))
 
 
@@ -183,10 +190,12 @@ def huber_loss(size: Floats, limit: float) -> Floats:
     return np.where(size <= limit, size**2, limit * (2.0 * size - limit))
 
 
-def least_absolute_scale(counted: Floats, way_m: Floats) -> Floats:
-    """Per row of `counted` (lags, ways) the scale with the least sum of absolute differences: a weighted median."""
+def least_absolute_scale(counted: Floats, moved_m: Floats) -> Floats:
+    """Per row of `counted` (lags, movements) the scale with the least sum of absolute differences: a weighted
+    median.
+    """
     weight = np.nan_to_num(np.abs(counted))
-    ratio = np.where(weight > 0.0, way_m / np.where(weight > 0.0, counted, 1.0), np.inf)
+    ratio = np.where(weight > 0.0, moved_m / np.where(weight > 0.0, counted, 1.0), np.inf)
     order = np.argsort(ratio, axis=1)
     sums = np.cumsum(np.take_along_axis(weight, order, axis=1), axis=1)
     middle = np.minimum((sums < 0.5 * sums[:, -1:]).sum(axis=1), ratio.shape[1] - 1)
@@ -194,17 +203,17 @@ def least_absolute_scale(counted: Floats, way_m: Floats) -> Floats:
     return np.where(np.isfinite(scale), scale, 1.0)
 
 
-def _spread(beside: Floats, left: Floats, used: Bools, reach: int) -> Floats:
-    """Variance of the moments where the noise is alike everywhere: by its autocovariance up to `reach` ways."""
+def _spread(instruments: Floats, left: Floats, used: Bools, reach: int) -> Floats:
+    """Variance of the moments where the noise is alike everywhere: by its autocovariance up to `reach` movements."""
     count = min(reach + 1, left.size)
     counts = used.astype(np.float64)
     pairs = np.array([counts[apart:] @ counts[: left.size - apart] for apart in range(count)])
     sums = np.array([left[apart:] @ left[: left.size - apart] for apart in range(count)])
     share = 1.0 - np.arange(count) / (reach + 1.0)
     covariance = share * sums / np.maximum(pairs, 1.0)
-    total: Floats = covariance[0] * beside.T @ beside
+    total: Floats = covariance[0] * instruments.T @ instruments
     for apart in range(1, count):
-        product = covariance[apart] * beside[apart:].T @ beside[:-apart]
+        product = covariance[apart] * instruments[apart:].T @ instruments[:-apart]
         total += product + product.T
     return total
 

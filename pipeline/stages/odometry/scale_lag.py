@@ -1,15 +1,15 @@
 """Scale and lag of a counter against another recorder of the same journey: the one estimator of both.
 
-way of the other = scale * way counted - scale * lag * change of speed,
+movement of the other = scale * movement counted - scale * lag * change of speed,
 
-with ways and speeds counted at the stamps less an assumed lag, and `lag` what is left of it: linear in scale and scale
-* lag. Evidence asks it for the clocks of reference and reads, the input checks for the odometer's against positions,
-calibration for the vehicle file; the causal filter (`alignment.odometer_filter`) follows the same equation from epoch
-to epoch. It knows neither where the ways come from nor what they are used for.
+with movements and speeds counted at the stamps less an assumed lag, and `lag` what is left of it: linear in scale and
+scale * lag. Evidence asks it for the clocks of reference and reads, the input checks for the odometer's against
+positions, calibration for the vehicle file; the causal filter (`alignment.odometer_filter`) follows the same equation
+from epoch to epoch. It knows neither where the movements come from nor what they are used for.
 
-The lag is searched over +- 30 s by the mean absolute difference of ways, each time at the scale that fits best, and
-refined from there by regression; then it is held against all lags far from it. No figure is told where another lag does
-nearly as well, or where the changes of speed are noise.
+The lag is searched over +- 30 s by the mean absolute difference of movements, each time at the scale that fits best,
+and refined from there by regression; then it is held against all lags far from it. No figure is given where another lag
+does nearly as well, or where the changes of speed are noise.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ from pipeline.stages.odometry.regression import (
     Regression,
     ScaleLag,
     half_apart,
-    has_enough_ways,
+    has_enough_movements,
     huber_loss,
     least_absolute_scale,
     robust_sigma,
@@ -38,34 +38,34 @@ from pipeline.stages.odometry.regression import (
 from schemas.arrays import Bools, Floats, Ints, median
 from schemas.frozen import frozen
 
-# Numerics: a lag shows where the speed changes, so ways over this time are compared, one every so often [s]; no longer
-# ones where a recorder pauses.
-WAY_S, WAY_EVERY_S = 10.0, 2.0
+# Numerics: a lag shows where the speed changes, so movements over this time are compared, one every so often [s]; no
+# longer ones where a recorder pauses.
+MOVEMENT_S, MOVEMENT_EVERY_S = 10.0, 2.0
 _LONGEST = 1.5
 # Numerics: range and step of the search [s].
 _FARTHEST_S, _STEP_S = 30.0, 0.5
 _LAGS_S: Floats = np.linspace(-_FARTHEST_S, _FARTHEST_S, 2 * round(_FARTHEST_S / _STEP_S) + 1)
-# Of the lags that few ways leave, where the noise is known.
+# Of the lags that few movements leave, where the noise is known.
 _FINE_S = 0.1
 _FINE_LAGS_S: Floats = np.linspace(-_FARTHEST_S, _FARTHEST_S, 2 * round(_FARTHEST_S / _FINE_S) + 1)
 _ROUNDS = 20
 _SCALES = 3
 # A lag stays where it moves by less than this share of its sigma.
 _STAYS = 0.05
-# Least number of ways for a lag, and for one of more than a second; no more are looked at in the search.
+# Least number of movements for a lag, and for one of more than a second; no more are looked at in the search.
 FEWEST, _FEWEST_FAR = 6, 12
 _NEAR_S = 1.0
-# Two ways fit some scale and lag.
+# Two movements fit some scale and lag.
 _FEWEST_TELLING = 2
 _SEARCHED = 800
-# A speed is taken over so much on both sides of an instant, and beside it from twice to four times that, so that the
+# A speed is taken over so much on both sides of an instant, and next to it from twice to four times that, so that the
 # rows whose noise is in one are not in the other [s].
 _SPEED_S = 0.5
 # Numerics: rows farther apart are joined by curves [s].
 _APART_S = 0.25
 # Outliers, in robust standard deviations: slip, or a step of the other recorder.
 _USUAL = 4.5
-# Numerics: ways are not written finer than this [m].
+# Numerics: movements are not written finer than this [m].
 _FINEST_M = 1e-3
 # A lag so many sigmas, and so many seconds, from the one found is far.
 _FAR_SIGMAS, _FAR_S = 15.0, 2.0
@@ -81,21 +81,23 @@ class CounterRows:
     row_sigma_m: float = 0.0
 
     def gained(self, begin_s: Floats, end_s: Floats) -> Floats:
-        """Way between instants [m]; NaN outside the recording and over a step in doubt."""
-        way_m = self._at(end_s, self.distance_m) - self._at(begin_s, self.distance_m)
+        """Movement between instants [m]; NaN outside the recording and over a step in doubt."""
+        moved_m = self._at(end_s, self.distance_m) - self._at(begin_s, self.distance_m)
         if self.doubtful[-1] == self.doubtful[0]:
-            return way_m
-        return np.where(self._at(begin_s, self.doubtful) == self._at(end_s, self.doubtful), way_m, np.nan)
+            return moved_m
+        return np.where(self._at(begin_s, self.doubtful) == self._at(end_s, self.doubtful), moved_m, np.nan)
 
     def _at(self, at_s: Floats, values: Floats) -> Floats:
+        """A column of the rows interpolated at instants; NaN outside the recording."""
         return np.interp(at_s, self.t_s, values, np.nan, np.nan)
 
     @cached_property
     def _half_s(self) -> float:
+        """Half of the time a speed is taken over [s]."""
         return max(_SPEED_S, median(np.diff(self.t_s)))
 
     def speeds(self, t_s: Floats) -> tuple[Floats, Floats]:
-        """Speed about each instant, and by rows beside these."""
+        """Speed about each instant, and by the rows next to these."""
         half_s = self._half_s
         near = self.gained(t_s - half_s, t_s + half_s) / (2.0 * half_s)
         before, after = (self.gained(t_s + a * half_s, t_s + b * half_s) for a, b in ((-4, -2), (2, 4)))
@@ -114,9 +116,9 @@ class CounterRows:
         speed = np.gradient(self.distance_m, self.t_s)
         begin = np.repeat(np.arange(step_s.size), parts)
         u = np.tile(np.arange(parts) / parts, step_s.size)
-        length_s, way_m = step_s[begin], np.diff(self.distance_m)[begin]
-        bent = (1.0 - u) * (speed[begin] * length_s - way_m) - u * (speed[begin + 1] * length_s - way_m)
-        distance_m = self.distance_m[begin] + u * way_m + u * (1.0 - u) * bent
+        length_s, moved_m = step_s[begin], np.diff(self.distance_m)[begin]
+        bent = (1.0 - u) * (speed[begin] * length_s - moved_m) - u * (speed[begin + 1] * length_s - moved_m)
+        distance_m = self.distance_m[begin] + u * moved_m + u * (1.0 - u) * bent
         t_s = self.t_s[begin] + u * length_s
         doubtful = self.doubtful[begin] + u * np.diff(self.doubtful)[begin]
         return CounterRows(
@@ -133,146 +135,164 @@ class CounterRows:
 
     @property
     def noise_m(self) -> float:
-        """Sigma of a way by the noise of its two rows."""
+        """Sigma of a movement by the noise of its two rows."""
         return max(self.row_sigma_m * float(np.sqrt(2.0)), _FINEST_M)
 
     def driven(self) -> CounterRows:
-        """Way driven, to and fro."""
+        """Distance driven, to and fro."""
         return replace(self, distance_m=np.concatenate([[0.0], np.cumsum(np.abs(np.diff(self.distance_m)))]))
 
 
 _Figure = TypeVar("_Figure", float, Floats)
 
 
-def slopes(way_m: _Figure, speed_mps: _Figure, scale: float = 1.0) -> tuple[_Figure, _Figure]:
-    """By how much the way of the other changes with scale and with lag; with scale * lag at a `scale` of 1."""
-    return way_m, -scale * speed_mps
+def slopes(moved_m: _Figure, speed_mps: _Figure, scale: float = 1.0) -> tuple[_Figure, _Figure]:
+    """Change of the other's movement with scale and with lag; with scale * lag at a `scale` of 1."""
+    return moved_m, -scale * speed_mps
 
 
 def spans_of_rows(t_s: Floats) -> tuple[Ints, Ints]:
-    """Begin and end of ways of 10 s, one every 2 s, among the rows of a recorder; none over a pause."""
-    rows = np.unique(np.searchsorted(t_s, np.arange(t_s[0], t_s[-1], WAY_EVERY_S))) if t_s.size else np.zeros(0, int)
-    ends = np.searchsorted(t_s, t_s[rows] + WAY_S)
+    """Begin and end of movements of 10 s, one every 2 s, among the rows of a recorder; none over a pause."""
+    rows = (
+        np.unique(np.searchsorted(t_s, np.arange(t_s[0], t_s[-1], MOVEMENT_EVERY_S))) if t_s.size else np.zeros(0, int)
+    )
+    ends = np.searchsorted(t_s, t_s[rows] + MOVEMENT_S)
     inside = ends < t_s.size
     begin, end = rows[inside], ends[inside]
-    whole = t_s[end] - t_s[begin] <= _LONGEST * WAY_S
+    whole = t_s[end] - t_s[begin] <= _LONGEST * MOVEMENT_S
     return begin[whole], end[whole]
 
 
-def scale_and_lag(begin_s: Floats, end_s: Floats, way_m: Floats, counter: CounterRows) -> ScaleLag:
-    """Of the recorder that saw the ways `way_m` between its stamps, in order of time; they may overlap."""
+def scale_and_lag(begin_s: Floats, end_s: Floats, moved_m: Floats, counter: CounterRows) -> ScaleLag:
+    """Scale and lag of the recorder that saw the movements `moved_m` between its stamps.
+
+    Args:
+        begin_s: stamps at which the movements begin, in order of time [s], shape (n,); they may overlap.
+        end_s: stamps at which they end [s], shape (n,).
+        moved_m: signed movements by that recorder [m], shape (n,).
+        counter: rows of the counter that they are compared with.
+
+    Returns:
+        Scale and lag with standard deviations, infinite where a figure is not measured.
+    """
     if begin_s.size < FEWEST:
         return ScaleLag()
-    ways = _DistancePairs(begin_s, end_s, way_m, counter.smooth)
-    found = ways.refined(ways.likeliest_s)
-    if ways.count < FEWEST or (ways.count < _FEWEST_FAR and abs(found.lag_s) > _NEAR_S):
-        return ways.without_lag(LagState.TOO_FEW)
+    pairs = _DistancePairs(begin_s, end_s, moved_m, counter.smooth)
+    found = pairs.refined(pairs.likeliest_s)
+    if pairs.count < FEWEST or (pairs.count < _FEWEST_FAR and abs(found.lag_s) > _NEAR_S):
+        return pairs.without_lag(LagState.TOO_FEW)
     if not found.measured:
-        return ways.without_lag(found.state)
-    return found if ways.stands_out(found) else ways.without_lag(LagState.AMBIGUOUS)
+        return pairs.without_lag(found.state)
+    return found if pairs.stands_out(found) else pairs.without_lag(LagState.AMBIGUOUS)
 
 
 def possible_lags(
-    ways: tuple[Floats, Floats, Floats], counter: CounterRows, sigma_m: Floats, scale_off: float, factor: float
+    movements: tuple[Floats, Floats, Floats], counter: CounterRows, sigma_m: Floats, scale_off: float, factor: float
 ) -> tuple[float, float] | None:
-    """Least and largest lag [s] that the ways (begin, end [s], length [m]) do not refute; None if they tell nothing.
+    """Least and largest lag [s] that the movements (begin, end [s], length [m]) do not refute; None if they tell
+    nothing.
 
-    A set of confidence at `factor` sigmas by the sum of squares, of ways with errors of `sigma_m` each or of what the
-    best lag leaves, if that is more, with the scale within 1 +- `scale_off`. They tell nothing where ways without any
-    error would not refute a lag at an end of the search: noise widens the set, and never makes it nothing. One or two
-    ways that tell nothing are too few to show that it is the journey, at one speed, that hides a lag: any is possible.
+    A set of confidence at `factor` sigmas by the sum of squares, of movements with errors of `sigma_m` each or of what
+    the best lag leaves, if that is more, with the scale within 1 +- `scale_off`. They tell nothing where movements
+    without any error would not refute a lag at an end of the search: noise widens the set, and never makes it nothing.
+    One or two movements that tell nothing are too few to show that it is the journey, at one speed, that hides a lag:
+    any is possible.
     """
-    begin_s, end_s, way_m = ways
+    begin_s, end_s, moved_m = movements
     if begin_s.size == 0:
         return None
-    apart = slice(None, None, _DistancePairs(begin_s, end_s, way_m, counter).step)
-    begin_s, end_s, seen, sigma_m = begin_s[apart], end_s[apart], way_m[apart] / sigma_m[apart], sigma_m[apart]
+    apart = slice(None, None, _DistancePairs(begin_s, end_s, moved_m, counter).step)
+    begin_s, end_s, observed, sigma_m = begin_s[apart], end_s[apart], moved_m[apart] / sigma_m[apart], sigma_m[apart]
     counted = counter.smooth.gained(begin_s - _FINE_LAGS_S[:, None], end_s - _FINE_LAGS_S[:, None]) / sigma_m
-    left = _left_over(counted, seen, scale_off)
-    # A way not counted at a lag does not refute it; where the best one is looked for it counts as one that fits.
+    left = _left_over(counted, observed, scale_off)
+    # A movement not counted at a lag does not refute it; where the best one is looked for it counts as one that fits.
     counts = np.isfinite(counted).sum(axis=1)
     likeliest = int((left + counts.max() - counts).argmin())
-    exact = np.where(np.isfinite(counted[likeliest]), counted[likeliest], seen)
+    exact = np.where(np.isfinite(counted[likeliest]), counted[likeliest], observed)
     if (_left_over(counted[[0, -1]], exact, scale_off) <= factor**2).any():
         return None if counts.max() > _FEWEST_TELLING else (-_FARTHEST_S, _FARTHEST_S)
     best = float(left[likeliest] + counts.max() - counts[likeliest])
-    # Two ways fit some lag and scale whatever their noise is.
+    # Two movements fit some lag and scale whatever their noise is.
     free = max(float(counts[likeliest]) - 2.0, 0.0)
     noise = max(student_factor(free) ** 2 * float(left[likeliest]) / free, 1.0) if free else 1.0
     possible = left - best <= factor**2 * noise
-    # One or two ways leave nothing over that would show that a slip was it, and no lag.
+    # One or two movements leave nothing over that would show that a slip was it, and no lag.
     possible[_FINE_LAGS_S.size // 2] |= free == 0.0
     lags_s = _FINE_LAGS_S[possible]
     return float(lags_s[0] - _FINE_S), float(lags_s[-1] + _FINE_S)
 
 
-def _left_over(counted: Floats, seen: Floats, scale_off: float) -> Floats:
-    """What the ways seen leave of those counted at each lag (rows), both in sigmas, at the scale that fits best.
+def _left_over(counted: Floats, observed: Floats, scale_off: float) -> Floats:
+    """What the movements observed leave of those counted at each lag (rows), both in sigmas, at the scale that fits
+    best.
 
     Sum of squares; of each no more than that of an outlier, a slip.
     """
-    known = np.isfinite(counted) & np.isfinite(seen)
-    counted, seen = np.where(known, counted, 0.0), np.where(known, seen, 0.0)
+    known = np.isfinite(counted) & np.isfinite(observed)
+    counted, observed = np.where(known, counted, 0.0), np.where(known, observed, 0.0)
     limits = 1.0 - scale_off, 1.0 + scale_off
-    scale = np.clip(least_absolute_scale(counted, seen), *limits)
+    scale = np.clip(least_absolute_scale(counted, observed), *limits)
     for _ in range(_SCALES):
-        used = np.where(np.abs(seen - scale[:, None] * counted) <= _USUAL, counted, 0.0)
+        used = np.where(np.abs(observed - scale[:, None] * counted) <= _USUAL, counted, 0.0)
         squares = (used * counted).sum(axis=1)
-        scale = np.where(squares > 0.0, np.clip((used * seen).sum(axis=1) / np.maximum(squares, 1e-9), *limits), scale)
-    return np.asarray(np.minimum((seen - scale[:, None] * counted) ** 2, _USUAL**2).sum(axis=1))
+        scale = np.where(
+            squares > 0.0, np.clip((used * observed).sum(axis=1) / np.maximum(squares, 1e-9), *limits), scale
+        )
+    return np.asarray(np.minimum((observed - scale[:, None] * counted) ** 2, _USUAL**2).sum(axis=1))
 
 
 @frozen
 class _DistancePairs:
-    """Ways that a recorder saw between its stamps, and the counter that counted them too."""
+    """Movements that a recorder saw between its stamps, and the counter that counted them too."""
 
     begin_s: Floats
     end_s: Floats
-    way_m: Floats
+    moved_m: Floats
     counter: CounterRows
 
     @property
     def count(self) -> float:
-        """So many that do not overlap."""
+        """Number of movements that do not overlap."""
         return 1.0 + (self.begin_s.size - 1.0) / self.overlap
 
     @cached_property
     def overlap(self) -> int:
-        """A way overlaps so many, itself and those after it."""
+        """A movement overlaps so many, itself and those after it."""
         after = np.searchsorted(self.begin_s, self.end_s - 1e-6)
         return max(1, round(median(after - np.arange(after.size))))
 
     @property
     def step(self) -> int:
-        """Of so many ways one is looked at in a search: they do not overlap."""
+        """One of so many movements is looked at in a search: they do not overlap."""
         return max(self.overlap, self.begin_s.size // _SEARCHED, 1)
 
     def _apart_m(self, lag_s: Floats) -> tuple[Floats, Floats]:
-        """How far ways that do not overlap are apart at each lag (lags, ways), at the scale that makes their sum least;
-        these scales.
+        """How far movements that do not overlap are apart at each lag (lags, movements), at the scale that makes their
+        sum least; these scales.
         """
         some = slice(None, None, self.step)
-        begin_s, end_s, way_m = (values[some] for values in (self.begin_s, self.end_s, self.way_m))
+        begin_s, end_s, moved_m = (values[some] for values in (self.begin_s, self.end_s, self.moved_m))
         counted = self.counter.gained(begin_s - lag_s[:, None], end_s - lag_s[:, None])
-        scale = least_absolute_scale(counted, way_m)
-        return np.abs(way_m - scale[:, None] * counted), scale
+        scale = least_absolute_scale(counted, moved_m)
+        return np.abs(moved_m - scale[:, None] * counted), scale
 
     @cached_property
     def _search(self) -> tuple[Floats, Floats]:
+        """How far movements are apart at each lag tried [m], and the scale at each."""
         return self._apart_m(_LAGS_S)
 
     @cached_property
     def likeliest_s(self) -> float:
-        """The lag that leaves the least mean difference, of those at which half of the ways are known."""
+        """The lag that leaves the least mean difference, of those at which half of the movements are known."""
         apart, _ = self._search
         mean = np.nansum(apart, axis=1) / np.maximum(np.isfinite(apart).sum(axis=1), 1)
-        return float(_LAGS_S[np.where(has_enough_ways(apart), mean, np.inf).argmin()])
+        return float(_LAGS_S[np.where(has_enough_movements(apart), mean, np.inf).argmin()])
 
     def _fits(self, lag_s: float) -> Bools:
         """Which lags of the search fit as well as this one: what they leave more is no more than chance.
 
         By Huber's loss. Under a lag that fits as well the sum of differences has at most twice the variance of the sum
-        of losses. Where less than half of the ways are known at both it is not said to fit.
+        of losses. Where less than half of the movements are known at both it is not said to fit.
         """
         here, _ = self._apart_m(np.full(1, lag_s))
         limit_m = _USUAL * max(robust_sigma(here[here > 0.0]), self.counter.noise_m)
@@ -280,7 +300,7 @@ class _DistancePairs:
         worse = losses - loss
         # An outlier is one at both lags: its losses differ by no more than by what noise does to it.
         chance = WORSE * np.sqrt(2.0 * np.nansum(np.minimum(loss, limit_m**2) ** 2))
-        fits: Bools = has_enough_ways(worse) & (np.nansum(worse, axis=1) <= chance)
+        fits: Bools = has_enough_movements(worse) & (np.nansum(worse, axis=1) <= chance)
         return fits
 
     def stands_out(self, found: ScaleLag) -> bool:
@@ -289,7 +309,9 @@ class _DistancePairs:
         return bool(far.any() and not self._fits(found.lag_s)[far].any())
 
     def without_lag(self, state: LagState) -> ScaleLag:
-        """The scale alone, as uncertain as it is over all lags that fit; not known where the ways are all noise."""
+        """The scale alone, as uncertain as it is over all lags that fit; not known where the movements are all
+        noise.
+        """
         found = self._regression(self.likeliest_s, _FARTHEST_S)
         if found is None:
             return ScaleLag(state=state)
@@ -320,31 +342,31 @@ class _DistancePairs:
         return replace(found, lag_sigma_s=found.lag_sigma_s + moved_s)
 
     def _regression(self, lag_s: float, doubt_s: float) -> Regression | None:
-        """At the lag assumed; `doubt_s`: by how much it may still be off, which makes no outlier."""
+        """The estimate at an assumed lag; `doubt_s`: by how much it may be off, which makes no outlier."""
         begin_s, end_s = self.begin_s - lag_s, self.end_s - lag_s
         counted = self.counter.gained(begin_s, end_s)
-        (first, first_beside), (last, last_beside) = self.counter.speeds(begin_s), self.counter.speeds(end_s)
+        (first, first_instrument), (last, last_instrument) = self.counter.speeds(begin_s), self.counter.speeds(end_s)
         design = np.column_stack(slopes(counted, last - first))
-        change_mps = last_beside - first_beside
-        # The counts of a coarse counter at one speed have a rhythm, in speeds as in ways: no changes of speed.
+        change_mps = last_instrument - first_instrument
+        # The counts of a coarse counter at one speed have a rhythm, in speeds as in movements: no changes of speed.
         change_mps = np.where(np.abs(change_mps) <= self.counter.least_change_mps, 0.0, change_mps)
-        beside = np.column_stack(slopes(counted, change_mps))
-        known = np.asarray(np.isfinite(np.column_stack([design, beside])).all(axis=1))
+        instruments = np.column_stack(slopes(counted, change_mps))
+        known = np.asarray(np.isfinite(np.column_stack([design, instruments])).all(axis=1))
         # Where both stand there is nothing to learn, nor of the noise.
         moving: Bools = known & (np.abs(counted) > 0.0)
         if moving.sum() < FEWEST:
             return None
-        design, beside = (np.where(known[:, None], values, 0.0) for values in (design, beside))
-        scale = float(least_absolute_scale(counted[None], self.way_m)[0])
+        design, instruments = (np.where(known[:, None], values, 0.0) for values in (design, instruments))
+        scale = float(least_absolute_scale(counted[None], self.moved_m)[0])
         theta = np.array([scale, 0.0])
         used = moving
         for _ in range(_ROUNDS):
-            left = self.way_m - design @ theta
+            left = self.moved_m - design @ theta
             spread = max(robust_sigma(np.abs(left[moving])), abs(scale) * self.counter.noise_m)
             kept = moving & (np.abs(left) <= _USUAL * spread + doubt_s * np.abs(scale * design[:, 1]))
             if kept.sum() < FEWEST:
                 return None
-            solved = solved_moments(design[kept], beside[kept], self.way_m[kept])
+            solved = solved_moments(design[kept], instruments[kept], self.moved_m[kept])
             same = np.array_equal(kept, used) and np.allclose(solved, theta, rtol=1e-9, atol=1e-9)
             theta, used = solved, kept
             if same:
@@ -352,4 +374,4 @@ class _DistancePairs:
         used = used & ~widened(moving & ~used, self.overlap // 2)
         if used.sum() < FEWEST:
             return None
-        return Regression(design, beside, self.way_m, used, self.overlap)
+        return Regression(design, instruments, self.moved_m, used, self.overlap)

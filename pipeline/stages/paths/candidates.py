@@ -29,17 +29,17 @@ BEND_M = 2.0
 class Segments(Polyline):
     """All segments of the network, element by element; `first[e] : first[e + 1]` are those of element e.
 
-    `vertex` at which each begins; `length_m` of each, and `way_m`: of all up to the end of each.
+    `vertex` at which each begins; `length_m` of each, and `distance_along_m`: of all up to the end of each.
     """
 
     element: Ints
     first: Ints
     vertex: Ints
     length_m: Floats
-    way_m: Floats
+    distance_along_m: Floats
 
     def search(self, box: Box | None = None) -> Search:
-        """Of all segments, or of those in a box: a run is looked for about itself, not in all of a network."""
+        """The search over all segments, or those in a box: a run needs only the part of a network about it."""
         from scipy.spatial import cKDTree  # takes long to load, and a log needs none
 
         rows = np.arange(len(self)) if box is None else box.touched_by(self.start, self.end)
@@ -52,9 +52,11 @@ class Segments(Polyline):
         some = np.union1d(rows, np.maximum(rows - 1, 0))
         pieces = np.maximum(1, np.ceil(self.length_m[some] / (0.25 * PROBE_SPACING_M))).astype(np.int64)
         segment = np.repeat(some, pieces)
+        # Number of each point within its segment.
         number = np.arange(len(segment)) - np.repeat(np.cumsum(pieces) - pieces, pieces)
         fraction = (number + 0.5) / np.repeat(pieces, pieces)
-        place = self.way_m[segment] - self.length_m[segment] * (1.0 - fraction)
+        place = self.distance_along_m[segment] - self.length_m[segment] * (1.0 - fraction)
+        # The first point in each bucket of distance along the element is enough.
         bucket = np.floor(place / (0.75 * PROBE_SPACING_M))
         new = np.ones(len(segment), dtype=np.bool_)
         new[1:] = (bucket[1:] != bucket[:-1]) | (np.diff(self.element[segment]) != 0)
@@ -106,6 +108,7 @@ class Candidates:
 
     @cached_property
     def _by_element(self) -> tuple[Ints, Ints]:
+        """Candidates in order of net element and step, and where each net element begins."""
         order = np.lexsort((self.step, self.element))
         most = int(self.element.max(initial=-1))
         return order, np.searchsorted(self.element[order], np.arange(most + 2))
@@ -117,7 +120,7 @@ class Candidates:
         return Candidates(first=np.searchsorted(step, np.arange(steps + 1)), **columns)
 
     def renumbered(self, kept: Bools) -> Candidates:
-        """As before, steps counted among the kept ones only; the others have no candidates."""
+        """The candidates with steps counted among the kept ones only; the others have no candidates."""
         number = np.cumsum(kept) - 1
         step = number[self.step]
         return replace(self, step=step, first=np.searchsorted(step, np.arange(int(kept.sum()) + 1)))
@@ -130,6 +133,7 @@ _COLUMNS = tuple(column.name for column in fields(Candidates) if column.name != 
 def segments_of(track: SurveyedTrack) -> Segments:
     """Segments of all elements."""
     owner = np.repeat(np.arange(len(track.ids)), np.diff(track.first))
+    # A segment begins at each vertex but the last of an element.
     head = np.flatnonzero(owner[:-1] == owner[1:])
     start = track.surface[head]
     end = track.surface[head + 1]
@@ -139,12 +143,22 @@ def segments_of(track: SurveyedTrack) -> Segments:
 
 
 def search_about(places: Floats, network: Network, reach_m: float) -> Search:
-    """Where to look for candidates of these places, up to a reach [m]."""
+    """The search for candidates about these places, up to a reach [m]."""
     return segments_of(network.track).search(box_about(places, reach_m + PROBE_SPACING_M))
 
 
 def candidates_of(points: Points, network: Network, search: Search, reach_m: float) -> Candidates:
-    """For every point the nearest place on each element whose distance is within reach [m]."""
+    """The nearest place on each element within reach of every point.
+
+    Args:
+        points: positions, shape (n, 3).
+        network: the track network.
+        search: where to look, as `search_about` makes it.
+        reach_m: largest distance of a place from its point [m].
+
+    Returns:
+        Places in order of point, then element.
+    """
     from scipy.spatial import cKDTree
 
     segments = search.segments
@@ -156,6 +170,7 @@ def candidates_of(points: Points, network: Network, search: Search, reach_m: flo
     step = step[order]
     segment = segment[order]
     element = segments.element[segment]
+    # Sorted by step, element and distance: the first row of each pair is the nearest probe.
     fresh = np.ones(len(step), dtype=bool)
     fresh[1:] = (step[1:] != step[:-1]) | (element[1:] != element[:-1])
     feet = downhill(points.take(step[fresh]), segments, segment[fresh], segments.element)
@@ -173,32 +188,34 @@ def overtaken(candidates: Candidates, network: Network) -> Bools:
     row, end = np.nonzero(np.isfinite(past_m))
     edge_first = network.successors.first
     edge_to = network.successors.to
+    # One row for each relation that leads on over that end.
     leaving = 2 * candidates.element[row] + 1 - end
     number = np.diff(edge_first)[leaving]
     edge = np.arange(number.sum()) - np.repeat(np.cumsum(number) - number - edge_first[leaving], number)
     row = np.repeat(row, number)
     end = np.repeat(end, number)
     entered = edge_to[edge]
+    # The candidate of the same step on the next element, looked up by step and element in one sorted number.
     keys = candidates.step * network.count + candidates.element
-    beside_key = candidates.step[row] * network.count + entered // 2
-    beside = np.minimum(np.searchsorted(keys, beside_key), len(keys) - 1)
+    rival_key = candidates.step[row] * network.count + entered // 2
+    rival = np.minimum(np.searchsorted(keys, rival_key), len(keys) - 1)
     row_m = past_m[row, end]
-    beside_m = past_m[beside, entered % 2]
-    rival = (keys[beside] == beside_key) & (beside != row)
-    beyond = rival & (row_m > 0.0) & np.isinf(beside_m)
-    nearer = rival & ((beside_m < row_m) | ((beside_m == row_m) & (beside < row)))
+    rival_m = past_m[rival, entered % 2]
+    competes = (keys[rival] == rival_key) & (rival != row)
+    beyond = competes & (row_m > 0.0) & np.isinf(rival_m)
+    nearer = competes & ((rival_m < row_m) | ((rival_m == row_m) & (rival < row)))
     out = np.zeros(len(keys), dtype=bool)
     while True:
         # Only by a candidate that is not overtaken itself, as at a switch another branch may hold it: so in rounds.
         now = np.zeros(len(keys), dtype=bool)
-        now[row[beyond | (nearer & ~out[beside])]] = True
+        now[row[beyond | (nearer & ~out[rival])]] = True
         if (now == out).all():
             return out
         out = now
 
 
 def _past_ends_m(candidates: Candidates) -> Floats:
-    """Per candidate how far it lies past its element's start and end [m], negative inside, infinite if not near."""
+    """How far each candidate lies past its element's start and end [m], negative inside, infinite if not near."""
     columns = []
     for past, inside_m in ((-1, candidates.along_m), (1, candidates.left_m)):
         inside = np.where((candidates.past == 0) & (inside_m < BEND_M), -inside_m, np.inf)
@@ -217,6 +234,7 @@ def merged(some: Candidates, added: Candidates, step_of_added: Ints) -> Candidat
 
 
 def _candidates(points: int, network: Network, segments: Segments, step: Ints, feet: Feet) -> Candidates:
+    """Feet on segments as places on net elements, one row each; `step`: the point that each foot belongs to."""
     segment = feet.segment
     element = segments.element[segment]
     held = np.clip(feet.fraction, 0.0, 1.0)
@@ -251,6 +269,7 @@ def _candidates(points: int, network: Network, segments: Segments, step: Ints, f
 
 def _headings_rad(track: SurveyedTrack, vertex: Ints) -> Floats:
     """Heading of the segments that begin at these vertices, clockwise from north."""
+    # Steps share vertices: each heading once.
     some, which = np.unique(vertex, return_inverse=True)
     places = points_of(track.latitude_deg[some], track.longitude_deg[some])
     along = track.surface[some + 1] - track.surface[some]

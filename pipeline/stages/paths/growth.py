@@ -24,11 +24,19 @@ _SURELY_ALIKE = 1.0 - 1e-9
 def path_set(steps: PathSteps, network: Network, config: MatchingConfig, search: Search | None = None) -> PathSet:
     """Every path that begins near the first positions and goes on over navigable relations, until it is refuted.
 
-    `steps`: of positions (`path_steps`), of a solution or of a reference, whose own bias and level `config` holds;
-    `network`: with elements that turn round in pieces (`network_in_pieces`), as `Node.element` counts them. Of the
-    result `living` gives the set of each step by what was known then, `to_the_end` in hindsight, both with the least
-    p-value of each path, and `elements` the same by net element. Without a position near the network the set is empty:
-    off the survey. `search`: of all that may be within reach, where many stretches share it.
+    Args:
+        steps: positions of a solution or of a reference, as `path_steps` makes them.
+        network: with elements that turn round in pieces (`network_in_pieces`), as `Node.element` counts them.
+        config: bias and level of these positions, in the section `matching` of the configuration.
+        search: the places within reach, where many stretches share them; None: looked for here.
+
+    Returns:
+        The set, whose `living` gives the paths of each step by what was known then, `to_the_end` in hindsight, both
+        with the least p-value of each path, and `elements` the same by net element. Empty without a position near the
+        network.
+
+    Source:
+        DOMAIN section 2, rules 1 to 7 (Neyman 1937).
     """
     search = search or search_about(steps.points.surface, network, config.reach_m)
     candidates = candidates_of(steps.points, network, search, config.reach_m)
@@ -64,6 +72,7 @@ class _Growth:
         self._returned: list[int] = []
 
     def grown(self) -> PathSet:
+        """Follow the hypothesis that begins first until none is left; begin anew where all are refuted."""
         count = len(self.steps)
         overflow = count
         start = self._begin(0)
@@ -78,7 +87,7 @@ class _Growth:
                     break
                 for child in self._follow(node):
                     self._push(child)
-            start = count if overflow < count else self._anew(self._made[first:])
+            start = count if overflow < count else self._restart_step(self._made[first:])
         self._unclaimed[overflow:] = True
         return PathSet(
             tuple(self._made),
@@ -100,8 +109,8 @@ class _Growth:
             self._begun_s.popleft()
         return len(self._begun_s) > self.config.paths_limit
 
-    def _anew(self, nodes: list[Node]) -> int:
-        """Where the set begins anew once these are all refuted: at once in the first minute, later where it came back.
+    def _restart_step(self, nodes: list[Node]) -> int:
+        """The step at which the set begins anew once all are refuted: at once in the first minute, else the return.
 
         The number of steps where one of them lives to the end, or nothing leads back.
         """
@@ -118,11 +127,13 @@ class _Growth:
             since_s = self.steps.end_s - self.steps.end_s[min(begin, count - 1)]
             self._unclaimed |= (since_s >= 0.0) & (since_s < self.config.paths_anew_s)
             return begin
-        self._returned.append(self._begin(self._came_back(last, died)))
+        self._returned.append(self._begin(self._return_step(last, died)))
         return self._returned[-1]
 
-    def _came_back(self, node: Node, died: int) -> int:
-        """The first step after a rejection by which a movement has led back to the path refuted last (`way_back`)."""
+    def _return_step(self, node: Node, died: int) -> int:
+        """The first step after a rejection by which a movement has led back to the path refuted last
+        (`ReturnSearch`).
+        """
         steps = self.steps
         ends_s = steps.end_s[died] - self.config.paths_level_s * np.array([3.0, 1.0])
         first, last = np.searchsorted(steps.end_s, ends_s, side="right")
@@ -142,14 +153,14 @@ class _Growth:
     def _near(self) -> Bools:
         """Candidates that a path may begin with: as near as the test of the offset allows."""
         candidates = self.candidates
-        limit_m = self.tests.offset_m(self.steps.sigma_m[candidates.step], self.survey_m, self._beside_m)
+        limit_m = self.tests.offset_m(self.steps.sigma_m[candidates.step], self.survey_m, self._track_spacing_m)
         near: Bools = (np.abs(candidates.offset_m) <= limit_m) & (
             self._inside(np.arange(len(candidates.step))) | (candidates.beyond_m <= self.config.paths_end_m)
         )
         return near
 
     def _stretch(self, oriented: int, rows: Ints) -> Stretch:
-        """Of an oriented element at its candidates."""
+        """The stretch of an oriented element at its candidates."""
         candidates = self.candidates
         turned = oriented % 2
         return Stretch(
@@ -161,18 +172,18 @@ class _Growth:
         )
 
     @cached_property
-    def _beside_m(self) -> Floats:
-        """Per candidate the distance to the nearest track on the side of the position [m], 0 without one."""
+    def _track_spacing_m(self) -> Floats:
+        """Distance from each candidate to the nearest track on the side of the position [m], 0 without one."""
         return np.where(self.candidates.offset_m > 0.0, *self._sides_m)
 
     @cached_property
     def _sides_m(self) -> tuple[Floats, Floats]:
-        """Per candidate how far left and right in its own sense the nearest other track lies [m], 0 without one.
+        """Distance of the nearest other track to the left and right of each candidate, in its sense [m], 0 without one.
 
-        The tracks of a step in the order in which they lie beside each other, but for those that end before it.
+        The tracks of a step in the order in which they lie side by side, but for those that end before it.
         """
         candidates = self.candidates
-        # Of tracks that run the other way the offset has the other sign.
+        # Of tracks that run in the other direction the offset has the other sign.
         first = candidates.first[:-1][candidates.step]
         turned = np.cos(candidates.heading_rad - candidates.heading_rad[first]) < 0.0
         aside_m = np.where(turned, -candidates.offset_m, candidates.offset_m)
@@ -187,6 +198,7 @@ class _Growth:
 
     @cached_property
     def _first_steps(self) -> Ints:
+        """Steps at which a path may begin."""
         return np.unique(self.candidates.step[self._near])
 
     def _push_all(self, step: int) -> None:
@@ -196,11 +208,12 @@ class _Growth:
             self._push(Node(2 * int(self.candidates.element[row]), step, stretch=step))
 
     def _push(self, node: Node) -> None:
+        """Queue a new hypothesis, unless it is like one on the same element: then that one stands for both."""
         same = self._by_element.setdefault(node.oriented, [])
-        way = ResidualsBefore(node, self.steps)
+        before = ResidualsBefore(node, self.steps)
         for other in same:
             covers = other.begin <= node.begin and (not other.followed or other.end > node.begin)
-            if covers and other.rejected >= node.rejected and self._alike(other, way):
+            if covers and other.rejected >= node.rejected and self._alike(other, before):
                 # Their tests cannot differ by more than the bounds allow for (rule 8).
                 other.p = max(other.p, node.p)
                 later = other.p_by_step[1 + node.begin - other.begin :]
@@ -215,7 +228,7 @@ class _Growth:
     def _alike(self, one: Node, new: ResidualsBefore) -> bool:
         """Two paths to one element that no test can tell apart by more than it allows for, whatever comes (rule 8).
 
-        Their means agree over every window that a later test may still look at, and over the whole way.
+        Their means agree over every window that a later test may still look at, and over their whole length.
         """
         other = new.node
         last, alike_m = other.begin, self.config.paths_alike_m
@@ -255,7 +268,7 @@ class _Growth:
         if stays:
             node.along = self._stretch(node.oriented, rows)
             node.left_m = np.column_stack([candidates.along_m[rows], candidates.left_m[rows]])
-            node.barred = min(node.barred, self._unread(node))
+            node.barred = min(node.barred, self._contradicted_step(node))
             node.rejected = min(node.rejected, node.barred)
             verdict = self.tests.of(self.steps, self._trail(node))
             node.p_by_step = np.minimum(node.p, np.concatenate([np.ones(1), verdict.p]))
@@ -277,19 +290,19 @@ class _Growth:
         along = Stretch.joined([one.along for one in chain])
         return Trail(node.stretch, chain[0].begin, node.begin, along, node.before)
 
-    def _unread(self, node: Node) -> int:
+    def _contradicted_step(self, node: Node) -> int:
         """The first step of the node at which a balise was read on an element that the train cannot have come from."""
-        for step in (node.begin + np.flatnonzero(self.steps.pinned[node.begin : node.end] >= 0)).tolist():
+        for step in (node.begin + np.flatnonzero(self.steps.read_element[node.begin : node.end] >= 0)).tolist():
             # A read belongs to the step after it: in the meantime the train went on.
-            way_m = (1.0 + self.config.detour_share) * float(self.steps.way_m[step]) + self.config.paths_end_m
-            if not self._within(node.element, int(self.steps.pinned[step]), way_m):
+            limit_m = (1.0 + self.config.detour_share) * float(self.steps.distance_m[step]) + self.config.paths_end_m
+            if not self._within(node.element, int(self.steps.read_element[step]), limit_m):
                 return int(step)
         return 2**62
 
-    def _within(self, one: int, other: int, way_m: float) -> bool:
+    def _within(self, one: int, other: int, limit_m: float) -> bool:
         """Two elements are the same, or not so far apart along the network."""
-        reached = (self.network.reach(2 * one + side, way_m).get(2 * other + to) for side in (0, 1) for to in (0, 1))
-        return one == other or any(reach is not None and reach.distance_m <= way_m for reach in reached)
+        reached = (self.network.reach(2 * one + side, limit_m).get(2 * other + to) for side in (0, 1) for to in (0, 1))
+        return one == other or any(reach is not None and reach.distance_m <= limit_m for reach in reached)
 
     def _inside(self, rows: Ints) -> Bools:
         """Places on the element; past an open end as far as the noise may lead."""
@@ -309,12 +322,12 @@ class _Growth:
         candidates = self.candidates
         rows = np.arange(int(candidates.first[step]), int(candidates.first[step + 1]))
         inside = rows[self._inside(rows) | (candidates.beyond_m[rows] <= self.config.paths_end_m)]
-        way_m = (1.0 + self.config.detour_share) * float(self.steps.way_m[step]) + self.config.detour_m
+        limit_m = (1.0 + self.config.detour_share) * float(self.steps.distance_m[step]) + self.config.detour_m
         reached: dict[int, int] = {}
         for leaving in (node.oriented, node.oriented ^ 1):
-            for to, reach in self.network.reach(leaving, way_m).items():
+            for to, reach in self.network.reach(leaving, limit_m).items():
                 allowed = min(reach.barred_forward, reach.barred_backward) == 0
-                if allowed and reach.distance_m <= way_m:
+                if allowed and reach.distance_m <= limit_m:
                     reached.setdefault(to // 2, to if leaving == node.oriented else to ^ 1)
         children = [
             self._child(node, reached[int(candidates.element[row])], step)
@@ -356,6 +369,7 @@ class _Growth:
         return children
 
     def _child(self, node: Node, oriented: int, step: int) -> Node:
+        """The hypothesis on the next element from a step on, with the sums of its whole path before it."""
         own = self.tests.totals(self.steps, node.begin, node.along)
         before = Totals(*(one + other for one, other in zip(node.before, own, strict=True)))
         child = Node(oriented, step, node.stretch, node, before, node.p)

@@ -50,6 +50,7 @@ class Node:
 
     @property
     def element(self) -> int:
+        """The net element, whatever the orientation."""
         return self.oriented // 2
 
     @property
@@ -65,7 +66,7 @@ class Node:
         return chain[::-1]
 
     def residuals_m(self, first: int, last: int) -> Floats:
-        """Of its path over the steps from `first` on, before `last`; NaN before its beginning."""
+        """Residuals of its path over the steps from `first` on, before `last` [m]; NaN before its beginning."""
         chain = self.since(first)
         known = np.concatenate([node.along.residual_m for node in chain])
         whole_m = np.full(last - first, np.nan)
@@ -86,12 +87,13 @@ class ResidualsBefore:
 
     @cached_property
     def begins(self) -> Ints:
+        """First step of the longest look back of each window."""
         end_s = self._steps.end_s
         return np.asarray(np.searchsorted(end_s, end_s[self.node.begin] - 3.0 * np.array(WINDOWS_S)))
 
     @cached_property
     def residual_m(self) -> Floats:
-        """Over the longest window [m]."""
+        """Residuals over the longest window [m]."""
         return self.node.residuals_m(int(self.begins[-1]), self.node.begin)
 
 
@@ -137,7 +139,7 @@ class PathSet:
         return spans
 
     def survivors(self) -> list[Node]:
-        """Those that live to the last step; of one that ends off the network, those refuted in its last minute."""
+        """Paths that live to the last step; of one that ends off the network, those refuted in its last minute."""
         count = len(self.steps)
         found: list[Node] = []
         for stretch in {node.stretch for node in self.nodes}:
@@ -163,7 +165,7 @@ class PathSet:
         return [Span(node, node.begin, end, np.full(end - node.begin, p)) for node, end, p in ends if end > node.begin]
 
     def elements(self, delay_s: float | None = None) -> list[dict[int, float]]:
-        """Per step the net elements that no rejection rules out, each with the largest p-value of a path over it.
+        """Net elements of each step that no rejection rules out, with the largest p-value of a path over each.
 
         In hindsight, or by what was known `delay_s` before the end of each step. Empty: off the network.
         """
@@ -174,7 +176,7 @@ class PathSet:
         return found
 
 
-# Numerics: lines over the switches passed on the way that are looked at; on more of them no way back is seen.
+# Numerics: lines over the switches passed meanwhile that are looked at; on more of them no return is found.
 _LINES = 24
 
 
@@ -222,7 +224,7 @@ class ReturnSearch:
     def _over_switches(self, left: Left, window: int) -> Iterator[int]:
         """Windows by which they have moved back on a line beyond a switch.
 
-        Behind it a branch moves aside as well as positions do: what counts is a movement beside all tracks within
+        Behind it a branch moves aside as well as positions do: what counts is a movement relative to all tracks within
         reach at once, which keep their distances from one another meanwhile.
         """
         lines = self._lines(left)
@@ -246,15 +248,17 @@ class ReturnSearch:
                     break
 
     def _stays(self, means_m: Floats, left: Left, window: int) -> Bools:
-        """It lies where it lay before for as long again: what only passes on its way to somewhere else does not."""
+        """It lies where it lay before for as long again: what only passes on towards somewhere else does not."""
         near = np.abs(means_m) <= self.config.paths_back_sigmas * self._root_m(left, means_m.size)
         stays: Bools = np.convolve(near, np.ones(window + 1))[: near.size] > window
         return stays
 
     def _root_m(self, left: Left, size: int) -> Floats:
+        """Uncertainty of the last steps, position and survey together [m]."""
         return np.hypot(self.steps.sigma_m[-size:], left.survey_m)
 
     def _moved_m(self, left: Left, size: int) -> Floats:
+        """Limit by which two means a while apart differ on no path, at the last steps [m]."""
         return self.tests.moved_m(self.steps.sigma_m[-size:], np.full(size, left.survey_m))
 
     def _windows_m(self, line: set[int], left: Left, window: int) -> Floats:
@@ -264,15 +268,15 @@ class ReturnSearch:
         """
         count = len(self.steps)
         nearest_m = np.full(count, np.inf)
-        beside_m = np.full(count, np.nan)
+        offset_m = np.full(count, np.nan)
         for one in line:
             rows = self.candidates.of(one // 2, left.died, count)
             rows = rows[self.candidates.beyond_m[rows] <= self.config.paths_end_m]
             rows = rows[self.candidates.distance_m[rows] < nearest_m[self.candidates.step[rows]]]
             step = self.candidates.step[rows]
             nearest_m[step] = self.candidates.distance_m[rows]
-            beside_m[step] = self.candidates.offset_m[rows] * (1.0 - 2.0 * (one % 2))
-        return np.asarray(sliding_window_view(beside_m[left.died :], window) - left.before_m)
+            offset_m[step] = self.candidates.offset_m[rows] * (1.0 - 2.0 * (one % 2))
+        return np.asarray(sliding_window_view(offset_m[left.died :], window) - left.before_m)
 
     def _lines(self, left: Left) -> list[set[int]]:
         """The line with every choice at the switches ahead, and with every one behind; none beyond what is near."""
@@ -281,6 +285,7 @@ class ReturnSearch:
         return onward + [{*ahead, *_turned(line)} for line in self._choices(left.oriented ^ 1, left.died)]
 
     def _choices(self, oriented: int, died: int) -> list[list[int]]:
+        """Chains of net elements from one on, over elements near the steps since a path died."""
         near = set(np.unique(self.candidates.element[self.candidates.first[died] :]).tolist())
         lines: list[list[int]] = []
         waiting = [[oriented]]
@@ -302,4 +307,5 @@ class ReturnSearch:
 
 
 def _turned(line: list[int]) -> list[int]:
+    """The same chain, run in the opposite direction."""
     return [one ^ 1 for one in line]

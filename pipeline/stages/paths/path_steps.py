@@ -21,7 +21,7 @@ from schemas.frozen import frozen
 _NEIGHBOURS = 3
 # The usual time between steps is that of so many before.
 _PERIOD_STEPS = 31
-# The direction of the way is that over so many steps before.
+# The direction of travel is that over so many steps before.
 _HEADING_STEPS = 5
 
 
@@ -29,10 +29,10 @@ _HEADING_STEPS = 5
 class PathSteps:
     """Means of a second of positions, shapes (n,); `points` (n, 3).
 
-    `t_ns`: mean time; `begin_s`, `end_s`: of its first and last position, since `start_ns`, the first of all;
-    `sigma_m` of the position across; `way_m`: since the step before, the larger of odometer and positions; `counted`:
-    it moved by a metre, and is no outlier; `along_m`: position along the track minus an independent odometer, NaN
-    without one; `with_odometer`: some odometer has told of the way by then; `pinned`: element of a balise read then,
+    `t_ns`: mean time; `begin_s`, `end_s`: of its first and last position, since `start_ns`, the first of all; `sigma_m`
+    of the position across; `distance_m`: since the step before, the larger of odometer and positions; `counted`: it
+    moved by a metre, and is no outlier; `along_m`: position along the track minus an independent odometer, NaN without
+    one; `with_odometer`: some odometer has measured a distance by then; `read_element`: element of a balise read then,
     else -1.
     """
 
@@ -42,17 +42,18 @@ class PathSteps:
     end_s: Floats
     points: Points
     sigma_m: Floats
-    way_m: Floats
+    distance_m: Floats
     counted: Bools
     along_m: Floats
     with_odometer: Bools
-    pinned: Ints
+    read_element: Ints
 
     def __len__(self) -> int:
         return len(self.end_s)
 
     @property
     def begin_ns(self) -> Ints:
+        """Instant of the first position of each step."""
         return np.round(self.begin_s * NS_PER_S).astype(np.int64) + self.start_ns
 
     @cached_property
@@ -74,21 +75,34 @@ def path_steps(
     t_ns: Ints,
     points: Points,
     sigma_m: Floats,
-    way: Callable[[Ints, Ints], Floats] | None = None,
+    distance: Callable[[Ints, Ints], Floats] | None = None,
     independent: bool = False,
-    pinned: Ints | None = None,
+    read_elements: Ints | None = None,
 ) -> PathSteps:
     """Means of a second of positions, in order of time; slower logs: single positions.
 
-    `sigma_m`: of each, across the track; `way`: distance between instants by an odometer [m], NaN where unknown;
-    `independent`: it is not made of the positions; `pinned`: element of a balise read at a position, else -1.
+    Args:
+        t_ns: times of the positions [ns], shape (n,).
+        points: the positions, shape (n, 3).
+        sigma_m: standard deviation of each across the track [m], shape (n,).
+        distance: signed distance between instants [ns] by an odometer [m], NaN where unknown; None without one.
+        independent: the odometer is not made of the positions.
+        read_elements: net element of the balise read at each position, else -1, shape (n,).
+
+    Returns:
+        One step a second, arrays of shape (steps,).
+
+    Source:
+        DOMAIN section 2, rule 1.
     """
     t_s = (t_ns - t_ns[0]) / NS_PER_S if t_ns.size else np.zeros(0)
     second = np.floor(t_s + 1e-6).astype(np.int64)
+    # The first position of each second, and the number of them.
     first = np.flatnonzero(np.diff(second, prepend=-1))
     size = np.diff(first, append=t_ns.size)
 
     def mean(values: Floats) -> Floats:
+        """Means over the positions of each second, shape (n, ...) to (steps, ...)."""
         return np.asarray(np.add.reduceat(values, first, axis=0).T / size).T
 
     means = Points(*(mean(vectors) for vectors in (points.surface, points.east, points.north)))
@@ -96,16 +110,16 @@ def path_steps(
     counted_m = np.full(len(means), np.nan)
     start_ns = int(t_ns[0]) if t_ns.size else 0
     middle_ns = np.round(mean(t_s) * NS_PER_S).astype(np.int64) + start_ns
-    if way is not None:
-        counted_m[1:] = way(middle_ns[:-1], middle_ns[1:])
+    if distance is not None:
+        counted_m[1:] = distance(middle_ns[:-1], middle_ns[1:])
     known = np.isfinite(counted_m)
     moved_m = np.where(known, np.abs(counted_m), chord_m)
     mean_sigma_m = np.sqrt(mean(sigma_m**2))
     counted = np.diff(np.floor(np.cumsum(moved_m)), prepend=-1.0) > 0
-    pins = np.full(len(means), -1, dtype=np.int64)
-    if pinned is not None:
-        read = np.flatnonzero(pinned >= 0)
-        pins[np.searchsorted(first, read, side="right") - 1] = pinned[read]
+    read_element = np.full(len(means), -1, dtype=np.int64)
+    if read_elements is not None:
+        read = np.flatnonzero(read_elements >= 0)
+        read_element[np.searchsorted(first, read, side="right") - 1] = read_elements[read]
     return PathSteps(
         t_ns=middle_ns,
         start_ns=start_ns,
@@ -113,11 +127,11 @@ def path_steps(
         end_s=t_s[first + size - 1],
         points=means,
         sigma_m=mean_sigma_m,
-        way_m=np.where(known, np.maximum(moved_m, chord_m), chord_m),
+        distance_m=np.where(known, np.maximum(moved_m, chord_m), chord_m),
         counted=counted & ~outliers(means, mean_sigma_m),
         along_m=_along_m(means, counted_m) if independent else np.full(len(means), np.nan),
         with_odometer=np.logical_or.accumulate(known),
-        pinned=pins,
+        read_element=read_element,
     )
 
 
@@ -127,6 +141,7 @@ def outliers(points: Points, sigma_m: Floats) -> Bools:
     reach = _NEIGHBOURS
     if count <= 2 * reach:
         return np.zeros(count, dtype=np.bool_)
+    # Midpoints of the neighbours k steps before and after: on a line at even speed all of them are the step's place.
     around = sliding_window_view(points.surface, 2 * reach + 1, axis=0)
     middles = [0.5 * (around[:, :, reach - k] + around[:, :, reach + k]) for k in range(1, reach + 1)]
     middle = np.median(np.stack(middles), axis=0)
@@ -137,12 +152,12 @@ def outliers(points: Points, sigma_m: Floats) -> Bools:
 
 
 def _along_m(points: Points, counted_m: Floats) -> Floats:
-    """Position along the way minus an independent odometer [m]; NaN where it does not count."""
+    """Position along the direction of travel minus an independent odometer [m]; NaN where it does not count."""
     if len(points) < _HEADING_STEPS:
         return np.full(len(points), np.nan)
     surface = points.surface
     rows = np.arange(len(points))
-    # The direction of the way, by positions before: the same for every path.
+    # The direction of travel, by positions before: the same for every path.
     ahead = surface - surface[np.maximum(rows - _HEADING_STEPS, 0)]
     ahead /= np.maximum(np.linalg.norm(ahead, axis=1, keepdims=True), 1e-6)
     moved_m = np.einsum("ij,ij->i", np.diff(surface, axis=0, prepend=surface[:1]), ahead)
@@ -150,7 +165,7 @@ def _along_m(points: Points, counted_m: Floats) -> Floats:
     return np.where(np.isfinite(counted_m), np.cumsum(apart_m), np.nan)
 
 
-# Ways that are looked for are longer than the distance by so many of its sigmas (`detour_share`, `detour_m`).
+# Routes that are searched for are longer than the distance by so many of its sigmas (`detour_share`, `detour_m`).
 _MARGIN_SIGMAS = 10.0
 
 
@@ -184,7 +199,7 @@ class Place(NamedTuple):
 class Moves:
     """`counted_m`: signed distance at each step by an odometer, NaN where unknown; `doubt_m`: running sum of its doubt.
 
-    Ways compare where nothing of the distance came into doubt between.
+    Distances compare where nothing of them came into doubt between.
     `polarity`: its sign against each oriented element, 0 where unknown.
     """
 
@@ -197,12 +212,13 @@ class Moves:
 
     @classmethod
     def without_odometer(cls, network: Network, steps: PathSteps, config: MatchingConfig) -> Moves:
+        """Moves of which only the positions say how far they are."""
         count = len(steps)
         unknown = np.zeros(len(network.successors), dtype=np.int64)
         return cls(network, steps, np.full(count, np.nan), np.zeros(count), unknown, config)
 
-    def way(self, earlier: int, later: int) -> StepDistance:
-        """By the odometer where it knows it, else straight on."""
+    def distance(self, earlier: int, later: int) -> StepDistance:
+        """Distance between steps by the odometer where it knows it, else straight on [m]."""
         places = self.steps.points.surface
         chord_m = float(np.linalg.norm(places[later] - places[earlier]))
         counted_m = float("nan")
@@ -213,13 +229,13 @@ class Moves:
         limit_m = (1.0 + self.config.detour_share) * max(chord_m, abs(distance_m)) + self.config.detour_m
         return StepDistance(distance_m, measured, limit_m)
 
-    def cost(self, here: Place, there: Place, way: StepDistance) -> float:
+    def cost(self, here: Place, there: Place, distance: StepDistance) -> float:
         """The least cost of a move between two places, infinite where the network has none."""
-        return min((cost for cost, _, _ in self._all(here, there, way)), default=np.inf)
+        return min((cost for cost, _, _ in self._all(here, there, distance)), default=np.inf)
 
     def best(self, here: Place, there: Place) -> Move | None:
         """The move of least cost, none where the network has none."""
-        moves = self._all(here, there, self.way(here.step, there.step))
+        moves = self._all(here, there, self.distance(here.step, there.step))
         chosen = min(moves, key=lambda move: move[0], default=None)
         if chosen is None:
             return None
@@ -228,34 +244,36 @@ class Moves:
 
     @property
     def break_cost(self) -> float:
-        """Of going over to a track that no relation leads to: so many seconds of positions off the path."""
+        """Cost of going over to a track that no relation leads to: so many seconds of positions off the path."""
         return self.config.break_s * self.config.outlier_sigmas**2
 
-    def _all(self, here: Place, there: Place, way: StepDistance) -> Iterator[tuple[float, int, tuple[int, ...]]]:
+    def _all(self, here: Place, there: Place, distance: StepDistance) -> Iterator[tuple[float, int, tuple[int, ...]]]:
         """Cost and sense of every move, and what lies between: on the element, ahead, behind.
 
         A relation that is passed against its navigability costs as much as a break.
         """
         if here.oriented == there.oriented:
-            yield self._mismatch(there.at_m - here.at_m, here.oriented, way), 0, ()
+            yield self._mismatch(there.at_m - here.at_m, here.oriented, distance), 0, ()
         for sense, first, last in ((1, here, there), (-1, there, here)):
             # From the exit of the first to the entry of the last, both run in the sense of their elements.
-            found = self.network.reach(first.oriented, way.limit_m).get(last.oriented)
+            found = self.network.reach(first.oriented, distance.limit_m).get(last.oriented)
             if found is None:
                 continue
             ends_m = self.network.length_m(first.oriented) - first.at_m + last.at_m
             driven_m = sense * (ends_m + found.distance_m)
-            cost = self._mismatch(driven_m, here.oriented, way)
+            cost = self._mismatch(driven_m, here.oriented, distance)
             barred = found.barred_forward if sense > 0 else found.barred_backward
             yield cost + (self.break_cost if barred else 0.0), sense, found.chain.between
-            if cost > 1.0 and way.measured and abs(driven_m) < abs(way.distance_m):
-                # Another way may be as long as the odometer says.
-                for chain in self._longer(first.oriented, last.oriented, sense, way.limit_m - ends_m):
+            if cost > 1.0 and distance.measured and abs(driven_m) < abs(distance.distance_m):
+                # Another route may be as long as the odometer says.
+                for chain in self._longer(first.oriented, last.oriented, sense, distance.limit_m - ends_m):
                     driven_m = sense * (ends_m + chain.entry_m[-1])
-                    yield self._mismatch(driven_m, here.oriented, way), sense, chain.between
+                    yield self._mismatch(driven_m, here.oriented, distance), sense, chain.between
 
     def _longer(self, first: int, last: int, sense: int, limit_m: float) -> Iterator[Chain]:
-        """Ways from the exit of an element to the entry of another, of those as long as each other the first found."""
+        """Routes from the exit of an element to the entry of another, of those as long as each other the first
+        found.
+        """
         apart_m = self.config.detour_m / _MARGIN_SIGMAS
         found = search(
             self.network,
@@ -267,20 +285,23 @@ class Moves:
         return (reach.chain for reach in islice(found, 1, None) if reach.chain.oriented[-1] == last)
 
     def _allowed(self, chain: Chain, sense: int) -> Iterator[Edge]:
+        """Edges that may be run over after a chain, in one sense."""
         onward = self.network.successors[chain.oriented[-1]]
         return (edge for edge in onward if (edge.forward if sense > 0 else edge.backward))
 
-    def _mismatch(self, driven_m: float, oriented: int, way: StepDistance) -> float:
-        """Square of the difference from the way made over its own sigma, limited as that of every position."""
-        sign = int(self.polarity[oriented]) if way.measured else 0
-        apart_m = driven_m - sign * way.distance_m if sign else abs(driven_m) - abs(way.distance_m)
-        root_m = (self.config.detour_share * abs(way.distance_m) + self.config.detour_m) / _MARGIN_SIGMAS
+    def _mismatch(self, driven_m: float, oriented: int, distance: StepDistance) -> float:
+        """Square of the difference from the distance run over its own sigma, limited as that of every position."""
+        sign = int(self.polarity[oriented]) if distance.measured else 0
+        apart_m = driven_m - sign * distance.distance_m if sign else abs(driven_m) - abs(distance.distance_m)
+        root_m = (self.config.detour_share * abs(distance.distance_m) + self.config.detour_m) / _MARGIN_SIGMAS
         return min((apart_m / root_m) ** 2, self.config.outlier_sigmas**2)
 
     @cached_property
     def _at_m(self) -> list[float]:
+        """Counted distance at each step, as a list [m]."""
         return [float(value) for value in self.counted_m]
 
     @cached_property
     def _doubts_m(self) -> list[float]:
+        """Uncertainty of the counted distance at each step, as a list [m]."""
         return [float(value) for value in self.doubt_m]

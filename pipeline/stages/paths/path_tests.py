@@ -67,7 +67,8 @@ NO_STEPS = Totals(*(0.0 for _ in range(6)))
 
 
 class Stretch(NamedTuple):
-    """Of a path at successive steps: residuals, sigmas of the survey, ways to the nearest tracks left and right [m].
+    """Of a path at successive steps: residuals, sigmas of the survey, distances to the nearest tracks left and right
+    [m].
 
     These are 0 where none is within reach; `heading_rad`: of the path, in whose sense residuals and sides are.
     """
@@ -80,6 +81,7 @@ class Stretch(NamedTuple):
 
     @classmethod
     def joined(cls, parts: Sequence[Stretch]) -> Stretch:
+        """One after the other."""
         return cls(*(np.concatenate(column) for column in zip(*parts, strict=True)))
 
     def upto(self, count: int) -> Stretch:
@@ -124,6 +126,7 @@ class PathTests:
 
     @classmethod
     def of_run(cls, steps: PathSteps, alone: int, config: MatchingConfig) -> PathTests:
+        """The tests with all that is known of the run without a path: windows, noise along the track."""
         windows = np.array([_windows(steps.end_s, window_s) for window_s in WINDOWS_S])
         late, early_end, early = np.moveaxis(windows, 1, 0)
         measured_m2 = np.full(late.shape, np.nan)
@@ -132,28 +135,30 @@ class PathTests:
                 measured_m2[number] = _measured_m2(steps, window_s)
         return cls(alone, measured_m2, _excess(steps, measured_m2), late, early_end, early, config)
 
-    def offset_m(self, sigma_m: Floats, survey_m: Floats, beside_m: Floats) -> Floats:
-        """How far beside its track a single step may lie, another one being so far away there, 0 for none [m]."""
+    def offset_m(self, sigma_m: Floats, survey_m: Floats, track_spacing_m: Floats) -> Floats:
+        """How far off its track a single step may lie, another one being so far away there, 0 for none [m]."""
         root_m = np.sqrt(self.config.cross_bias_sigma_m**2 + survey_m**2 + sigma_m**2)
-        return np.asarray(root_m * self._limits_of_offsets(root_m, beside_m, LOOKED_S / self.config.paths_level_s))
+        return np.asarray(
+            root_m * self._limits_of_offsets(root_m, track_spacing_m, LOOKED_S / self.config.paths_level_s)
+        )
 
     def moved_m(self, sigma_m: Floats, survey_m: Floats) -> Floats:
-        """By more than so much two means of `paths_level_s`, a while apart, differ on no path [m]."""
+        """Limit by which two means of `paths_level_s`, a while apart, differ on no path [m]."""
         limit = _size(self.config.paths_alpha, LOOKED_S / self.config.paths_level_s)
         return np.asarray(limit * np.sqrt(2.0) * np.hypot(sigma_m, survey_m))
 
     @property
     def longest_s(self) -> float:
-        """As far back as a movement looks."""
+        """The longest time that a movement looks back [s]."""
         return 3.0 * WINDOWS_S[-1]
 
     def totals(self, steps: PathSteps, begin: int, along: Stretch) -> Totals:
-        """Over the steps from `begin` on."""
+        """Sums over the steps from `begin` on."""
         counted = self._step_terms(steps, begin, along)
         return Totals(*(float(value) for value in counted[: len(NO_STEPS)].sum(axis=1)))
 
     def farthest_m(self, steps: PathSteps, apart_m: Floats, last: int, window_s: float) -> float:
-        """Of differences at the steps before `last`, 0 where none counts, the largest mean over any window [m].
+        """Largest mean over any window of differences at the steps before `last`, 0 where none counts [m].
 
         Windows may end later, where nothing differs; none counts with fewer than `_WHOLE` of its steps.
         """
@@ -194,7 +199,8 @@ class PathTests:
         return Verdict(int(at[first[0]]) if first.size else 2**62, np.minimum.accumulate(p))
 
     def _step_terms(self, steps: PathSteps, begin: int, along: Stretch) -> Floats:
-        """Per step 1, residual, sigma of the survey, square of the position's, tracks beside, normal (north, east).
+        """Per step 1, residual, sigma of the survey, square of the position's, tracks to both sides, normal (north,
+        east).
 
         Zeros where it does not count; shape (8, n).
         """
@@ -247,7 +253,7 @@ class PathTests:
         return self._in_sigmas(part, part[0] >= least, self.excess[at], LOOKED_S / self.config.paths_level_s)
 
     def _lasting(self, steps: PathSteps, sums: Floats, trail: Trail, at: Ints) -> _Test:
-        """The mean of the whole way."""
+        """The mean over the whole path."""
         own = sums[:, at + 1 - trail.start] - sums[:, [trail.begin - trail.start]]
         part = own[: len(NO_STEPS)] + np.array(trail.before)[:, None]
         lasted_s = np.maximum(steps.end_s[at] - steps.end_s[trail.first], 1e-9)
@@ -260,26 +266,27 @@ class PathTests:
         root_m = np.sqrt(self.config.cross_bias_sigma_m**2 + mean[1] ** 2 + mean[2] * share)
         sigmas = np.where(usable & (root_m > 0.0), np.abs(mean[0]) / np.maximum(root_m, 1e-9), 0.0)
         # If the train is on it all the same, the track on the side of the positions is left instead.
-        beside_m = np.where(mean[0] > 0.0, mean[3], mean[4])
-        return _Test(sigmas[None], self._limits_of_offsets(root_m, beside_m, looks)[None], np.array([looks]))
+        track_spacing_m = np.where(mean[0] > 0.0, mean[3], mean[4])
+        return _Test(sigmas[None], self._limits_of_offsets(root_m, track_spacing_m, looks)[None], np.array([looks]))
 
-    def _limits_of_offsets(self, root_m: Floats, beside_m: Floats, looks: float) -> Floats:
+    def _limits_of_offsets(self, root_m: Floats, track_spacing_m: Floats, looks: float) -> Floats:
         """Limits in sigmas of an offset, another track being so far away, 0 for none."""
-        beside = np.where(beside_m > 0.0, beside_m / np.maximum(root_m, 1e-9), np.inf)
-        return _limits_beside(beside, self.config.paths_alpha, looks)
+        spacing = np.where(track_spacing_m > 0.0, track_spacing_m / np.maximum(root_m, 1e-9), np.inf)
+        return _limits_by_spacing(spacing, self.config.paths_alpha, looks)
 
 
-def told_by_a_switch_m(survey_m: Floats, alpha: float, merged_m: float) -> Floats:
-    """How far apart tracks have to be for a movement from one to the other to be seen, with exact positions [m]."""
+def switch_resolution_m(survey_m: Floats, alpha: float, merged_m: float) -> Floats:
+    """How far apart tracks must be for a movement from one to the other to show, with exact positions [m]."""
     return np.asarray(_size(alpha, LOOKED_S / WINDOWS_S[0]) * np.sqrt(2.0) * survey_m + 2.0 * merged_m)
 
 
-def told_by_offset_m(survey_m: Floats, alpha: float, bias_m: float) -> Floats:
+def offset_resolution_m(survey_m: Floats, alpha: float, bias_m: float) -> Floats:
     """How far apart tracks have to be for a lasting offset to tell them apart, with exact positions [m]."""
     return np.asarray(_size(alpha, _LASTING_LOOKS) * np.hypot(bias_m, survey_m))
 
 
 def _size(alpha: float, looks: float) -> float:
+    """Size of one look of a test whose looks together have the size alpha."""
     return float(_sizes(alpha, np.array([looks]))[0])
 
 
@@ -290,16 +297,16 @@ def _sizes(alpha: float, looks: Floats) -> Floats:
     return np.asarray(-ndtri(alpha / (_TESTS * looks * 2.0)))
 
 
-def _limits_beside(beside: Floats, alpha: float, looks: float) -> Floats:
-    """Limits of an offset where another track lies so many of its sigmas beside the path, infinite: none [sigmas].
+def _limits_by_spacing(spacing: Floats, alpha: float, looks: float) -> Floats:
+    """Limits of an offset where another track lies so many of its sigmas away from the path, infinite: none [sigmas].
 
-    As seldom as its level says an offset refutes the true track and leaves the one beside it: a wrong claim. It makes a
-    right one as often as the other track is beyond the limit while the train is on this one. Where that is seldom too,
-    the limit grows until of both together no more are wrong than claims may be; at the most up to that of a level as
-    much smaller, for what is more seldom is claimed in no run.
+    As seldom as its level says an offset refutes the true track and leaves the neighbouring one: a wrong claim. It
+    makes a right one as often as the other track is beyond the limit while the train is on this one. Where that is
+    seldom too, the limit grows until of both together no more are wrong than claims may be; at the most up to that of a
+    level as much smaller, for what is more seldom is claimed in no run.
     """
     limits, needed = _limits_and_needed(alpha, looks)
-    return np.interp(-beside, -needed, limits)
+    return np.interp(-spacing, -needed, limits)
 
 
 @cache
@@ -310,12 +317,13 @@ def _limits_and_needed(alpha: float, looks: float) -> tuple[Floats, Floats]:
     share = 1.0 - ONE_TRACK_LEFT
     limits = np.linspace(_size(alpha, looks), _size(alpha * share, looks), 100)
     # So often the other track has to be beyond the limit, and so far away it is.
-    told = looks * _tails(limits) / share
-    limits, told = limits[told < 1.0], told[told < 1.0]
-    return limits, limits + ndtri(told)
+    rate = looks * _tails(limits) / share
+    limits, rate = limits[rate < 1.0], rate[rate < 1.0]
+    return limits, limits + ndtri(rate)
 
 
 def _tails(sigmas: Floats) -> Floats:
+    """Probability of a standard normal value above so many sigmas."""
     from scipy.special import ndtr
 
     return np.asarray(ndtr(-sigmas))
@@ -323,7 +331,7 @@ def _tails(sigmas: Floats) -> Floats:
 
 @cache
 def _greatest_shares(tau_s: float) -> Floats:
-    """Per window the variance of a movement over that of the noise, the greatest over all noises of at least `tau_s`.
+    """Variance of a movement over that of the noise in each window, the greatest over all noises of `tau_s` or more.
 
     Of Gauss-Markov noises with these correlation times.
     """
@@ -340,7 +348,7 @@ def _greatest_shares(tau_s: float) -> Floats:
 
 
 def _windows(t_s: Floats, window_s: float) -> tuple[Ints, Ints, Ints]:
-    """Of the last window the first step, of the window before the last but one the step after it, and its first."""
+    """First step of the last window; the step after the window before the last but one, and the first step of that."""
     late, early_end, early = (np.searchsorted(t_s, t_s - k * window_s, side="right") for k in (1.0, 2.0, 3.0))
     return late, early_end, early
 
@@ -367,6 +375,7 @@ def _measured_m2(steps: PathSteps, window_s: float) -> Floats:
     late, early_end, early = _windows(steps.end_s, window_s)
     period_s = steps.period_s
     counts = np.concatenate([[0], np.cumsum(known)])
+    # Sum and number of a window's values: differences of running ones.
     sums = np.concatenate([[0.0], np.cumsum(np.where(known, steps.along_m, 0.0))])
     late_count = counts[rows + 1] - counts[late]
     early_count = counts[early_end] - counts[early]
@@ -377,6 +386,7 @@ def _measured_m2(steps: PathSteps, window_s: float) -> Floats:
     moved_m = np.where(whole, moved_m, 0.0)
     number = np.cumsum(whole)
     mean_m = np.cumsum(moved_m) / np.maximum(number, 1)
+    # Var(x) = E[x^2] - E[x]^2, of all windows up to each step.
     variance_m2 = np.cumsum(moved_m**2) / np.maximum(number, 1) - mean_m**2
     enough = number >= _MEASURED_WINDOWS * window_s / period_s
     return np.where(enough, np.maximum(variance_m2, 0.0), np.nan)

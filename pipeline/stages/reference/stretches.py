@@ -11,7 +11,7 @@ import polars as pl
 from pipeline.stages.paths.candidates import Candidates, Search, candidates_of, search_about, segments_of
 from pipeline.stages.paths.growth import path_set
 from pipeline.stages.paths.path_steps import path_steps
-from pipeline.stages.reference.ways import ElementStay, ways_of
+from pipeline.stages.reference.routes import ElementStay, routes_of
 from pipeline.stages.track.geodesy import Points, points_of, steps_m
 from pipeline.stages.track.network import Network
 from pipeline.stages.track.path import Chain, RoutePath, moved_on
@@ -24,7 +24,7 @@ from schemas.frozen import frozen
 
 @frozen
 class ReferencePath:
-    """One way that the samples of a stretch may have taken: per sample its leg and the coordinate on it [m].
+    """One route that the samples of a stretch may have taken: per sample its leg and the coordinate on it [m].
 
     `aside_m`: distance of the sample from the track; `root_m`: sigma of that, of sample and survey together.
     """
@@ -36,14 +36,14 @@ class ReferencePath:
     root_m: Floats
 
     def part(self, rows: slice) -> ReferencePath:
-        """Of some samples."""
+        """The same path, of some samples only."""
         arrays = {name: getattr(self, name)[rows] for name in ("leg", "at_m", "aside_m", "root_m")}
         return replace(self, **arrays)
 
 
 @frozen
 class ReferenceStretch:
-    """Reference samples from gap to gap, and every way that they may have taken: the train was on one of them."""
+    """Reference samples from gap to gap, and every route that they may have taken: the train was on one of them."""
 
     t_ns: Ints
     sigma_m: Floats
@@ -53,11 +53,22 @@ class ReferenceStretch:
 def reference_stretches(
     reference: pl.DataFrame | None, network: Network, numbers: dict[str, int], config: Configuration
 ) -> tuple[list[ReferenceStretch], list[tuple[int, int]]]:
-    """Stretches of the reference with their ways, and the times at which samples exist but lie on no track [ns].
+    """Stretches of the reference with every route that it may have taken.
 
-    `network`: with elements that turn round in pieces; `numbers`: net elements as the caller counts them. An element is
-    in the set if a navigable way through the whole stretch runs over it that the samples do not refute: the set of
-    `paths` with the reference's own sigma and level, and no bias.
+    An element is in the set if a navigable route through the whole stretch runs over it that the samples do not refute:
+    the set of `paths` with the reference's own sigma and level, and no bias.
+
+    Args:
+        reference: the stream `reference` in order of time, or None.
+        network: with elements that turn round in pieces (`network_in_pieces`).
+        numbers: net elements by name, as the caller counts them.
+        config: the configuration; used are `hazards` (sigmas, gap), `matching` and `align`.
+
+    Returns:
+        The stretches, and the spans (begin, end) at which samples exist but lie on no track [ns].
+
+    Source:
+        DOMAIN section 5.1.
     """
     if reference is None or reference.is_empty():
         return [], []
@@ -75,7 +86,7 @@ def reference_stretches(
             part = slice(int(rows[0]), int(rows[-1]) + 1)
             stretches.append(ReferenceStretch(samples.t_ns[part], samples.sigma_m[part], paths))
             covered[part] = True
-    return stretches, _silent_spans(samples.t_ns, covered, hazards.reference_gap_s)
+    return stretches, _spans_off_track(samples.t_ns, covered, hazards.reference_gap_s)
 
 
 def _between_gaps(t_ns: Ints, rows: Ints, gap_s: float) -> list[Ints]:
@@ -86,8 +97,8 @@ def _between_gaps(t_ns: Ints, rows: Ints, gap_s: float) -> list[Ints]:
     return np.split(rows, np.flatnonzero(broken) + 1)
 
 
-def _silent_spans(t_ns: Ints, covered: Bools, gap_s: float) -> list[tuple[int, int]]:
-    """Times beside samples that lie nowhere, up to the next one that does: nobody knows where the train was."""
+def _spans_off_track(t_ns: Ints, covered: Bools, gap_s: float) -> list[tuple[int, int]]:
+    """Times next to samples that lie on no track, up to the next one that does: nobody knows where the train was."""
     gap_ns = round(gap_s * NS_PER_S)
     known_ns = t_ns[covered]
     spans: list[tuple[int, int]] = []
@@ -112,7 +123,7 @@ class _Search:
     config: Configuration
 
     def paths(self, rows: Ints) -> tuple[Ints, tuple[ReferencePath, ...]]:
-        """All ways through samples without a gap, and those they run through.
+        """All routes through samples without a gap, and those they run through.
 
         None where they are more than `routes_limit`, or all are refuted; where a movement led back from aside, those
         through the samples after it.
@@ -130,12 +141,12 @@ class _Search:
         found = path_set(steps, self.network, law, samples.search)
         begins = rows[0] + np.searchsorted(samples.t_ns[rows], steps.begin_ns)
         ends = np.append(begins[1:], rows[-1] + 1)
-        first, ways = ways_of(found, law, hazards.routes_limit)
+        first, routes = routes_of(found, law, hazards.routes_limit)
         begins, ends = begins[first:], ends[first:]
-        return rows[int(begins[0] - rows[0]) :], tuple(self._path(stays, begins, ends) for stays in ways)
+        return rows[int(begins[0] - rows[0]) :], tuple(self._path(stays, begins, ends) for stays in routes)
 
     def _path(self, stays: Sequence[ElementStay], begins: Ints, ends: Ints) -> ReferencePath:
-        """A way with coordinates: each sample on the nearest of the elements that the way visits about then.
+        """A route with coordinates: each sample on the nearest of the elements that it visits about then.
 
         `begins`, `ends`: of each step the first sample, and that after its last.
         """
@@ -159,16 +170,16 @@ class _Search:
             leg[sample] = number
             at_m[sample] = entry_m + (near.left_m[rows] if stay.oriented % 2 else near.along_m[rows])
             survey_m[sample] = samples.survey_m[rows]
-        on_way = np.flatnonzero(leg >= 0)
+        on_route = np.flatnonzero(leg >= 0)
         every = np.arange(count)
-        leg = leg[on_way[np.maximum(np.searchsorted(on_way, every, side="right") - 1, 0)]]
+        leg = leg[on_route[np.maximum(np.searchsorted(on_route, every, side="right") - 1, 0)]]
         routes = tuple(chain.route(self.network, self.numbers) for chain in legs)
         root_m = np.hypot(samples.sigma_m[begin : begin + count], survey_m)
-        return ReferencePath(leg, np.interp(every, on_way, at_m[on_way]), routes, nearest_m, root_m)
+        return ReferencePath(leg, np.interp(every, on_route, at_m[on_route]), routes, nearest_m, root_m)
 
 
 def _legs(stays: Sequence[ElementStay], network: Network) -> tuple[list[Chain], list[tuple[int, float]]]:
-    """The way as chains of one coordinate, and of each visit its chain and where it is entered [m]."""
+    """The route as chains of one coordinate, and of each visit its chain and where it is entered [m]."""
     chains = [Chain((stays[0].oriented,), (0.0,))]
     placed = [(0, 0.0)]
     at = 0
@@ -185,7 +196,7 @@ _SAMPLES = 50
 def off_the_survey(samples: Samples, network: Network, config: HazardConfig) -> Bools:
     """Samples behind an open end over which the train may have gone, where another track is near.
 
-    Up to `open_end_m` from that end, or until the samples lie beside the element again.
+    Up to `open_end_m` from that end, or until the samples lie next to the element again.
     """
     count = samples.t_ns.size
     near = samples.near
@@ -198,7 +209,7 @@ def off_the_survey(samples: Samples, network: Network, config: HazardConfig) -> 
         sample = near.step[rows]
         behind = near.past[rows] == 2 * end - 1
         other_near = tracks > np.bincount(sample, minlength=tracks.size)
-        for first, sense in _left(sample, behind, possible[rows]):
+        for first, sense in _departures(sample, behind, possible[rows]):
             back = np.linalg.norm(samples.points.surface - ends[element, end], axis=1) > config.open_end_m
             back[sample[~behind]] = True
             # In the sense in which the train left, all samples until it may be back.
@@ -214,7 +225,7 @@ def _open_ends(network: Network, elements: Ints) -> Iterator[tuple[int, int]]:
         yield int(elements[row]), int(end)
 
 
-def _left(sample: Ints, behind: Bools, possible: Bools) -> Iterator[tuple[int, int]]:
+def _departures(sample: Ints, behind: Bools, possible: Bools) -> Iterator[tuple[int, int]]:
     """Samples at which the train leaves the element over its end, and in which sense of time (+1, -1)."""
     for number in np.flatnonzero(behind[1:] & ~behind[:-1]).tolist():
         if np.median(possible[max(number + 1 - _SAMPLES, 0) : number + 1]) >= 0.5:
@@ -225,7 +236,7 @@ def _left(sample: Ints, behind: Bools, possible: Bools) -> Iterator[tuple[int, i
 
 
 def leaving(samples: Samples, on_track: Bools, config: Configuration) -> Bools:
-    """Samples beside a track on which the train may not be any more, or not yet: they border on samples on no track.
+    """Samples next to a track on which the train may not be any more, or not yet: they border on samples on no track.
 
     It left over a switch that the survey lacks, so from the last sample within `paths_back_sigmas` roots of a track on,
     and for no longer than `reference_leaves_m`: by then the longest switches have led aside. `on_track`: samples that
@@ -236,7 +247,7 @@ def leaving(samples: Samples, on_track: Bools, config: Configuration) -> Bools:
     np.minimum.at(roots, near.step, near.distance_m / samples.root_m)
     aside = roots > config.matching.paths_back_sigmas
     gap = np.diff(samples.t_ns) > config.hazards.reference_gap_s * NS_PER_S
-    way_m = np.concatenate([[0.0], np.cumsum(steps_m(samples.points.surface))])
+    distance_m = np.concatenate([[0.0], np.cumsum(steps_m(samples.points.surface))])
     unsure = np.zeros(on_track.size, dtype=np.bool_)
     for off, sense in [
         *((row + 1, -1) for row in np.flatnonzero(on_track[:-1] & ~on_track[1:] & ~gap).tolist()),
@@ -247,7 +258,7 @@ def leaving(samples: Samples, on_track: Bools, config: Configuration) -> Bools:
             0 <= row < on_track.size
             and on_track[row]
             and aside[row]
-            and abs(way_m[row] - way_m[off]) <= config.hazards.reference_leaves_m
+            and abs(distance_m[row] - distance_m[off]) <= config.hazards.reference_leaves_m
         ):
             unsure[row] = True
             row += sense
@@ -270,6 +281,7 @@ class Samples:
 
     @property
     def root_m(self) -> Floats:
+        """Sigma of sample and survey together at each place near it [m]."""
         return np.hypot(self.sigma_m[self.near.step], self.survey_m)
 
     def placed(self, factor: float) -> Bools:
@@ -280,7 +292,7 @@ class Samples:
 
 
 def samples_of(reference: pl.DataFrame, network: Network, config: Configuration) -> Samples:
-    """Of a reference stream; places twice as far off as any that can be a sample's."""
+    """Samples of a reference stream; places twice as far off as any that can be a sample's."""
     hazards = config.hazards
     sigma_m = reference["sigma_m"].fill_null(hazards.reference_sigma_m).to_numpy()
     points = points_of(floats(reference, "latitude_deg"), floats(reference, "longitude_deg"))

@@ -10,14 +10,16 @@ import numpy as np
 import polars as pl
 
 from pipeline.stages.epochs.clock import Clock, reaction_of
-from schemas.arrays import NS_PER_S, Bools, Floats, Ints, times_ns, truths
+from pipeline.stages.epochs.verdicts import Verdicts
+from pipeline.stages.judge.judged import JudgedEpochs
+from schemas.arrays import NS_PER_S, Bools, Floats, Ints, times_ns
 from schemas.config import Configuration
 from schemas.conform import dtypes
 from schemas.enums import (
     TRUTH,
     Judgement,
+    LdsMode,
     LostTo,
-    MonitorState,
     Origin,
     Reason,
     Remedy,
@@ -26,12 +28,13 @@ from schemas.enums import (
     Verdict,
 )
 from schemas.frozen import frozen
-from schemas.stages import EpochFigures
+from schemas.stages import NO_REASON
 from schemas.tables import ALL_MONITORS, MONITORS, Epochs
 from schemas.words import lost_words
 
 _LOST_TO = dtypes(Epochs)["lost_to"]
 _NUMBER = {cause: number for number, cause in enumerate(LostTo)}
+_FAIL_SAFE = tuple(LdsMode).index(LdsMode.FAIL_SAFE)
 
 
 @frozen
@@ -84,8 +87,19 @@ class LostColumns:
         ]
 
 
-def lost_columns(epochs: EpochFigures, config: Configuration) -> LostColumns:
-    """Lost to the first cause that applies. A gap is time without a position, as for `availability`."""
+def lost_columns(epochs: JudgedEpochs, config: Configuration) -> LostColumns:
+    """Moving time by the first cause that applies. A gap is time without a position, as for `availability`.
+
+    Args:
+        epochs: of one solution, judged.
+        config: the configuration; used are `lds` and `align.gap_reset_s`.
+
+    Returns:
+        For each epoch the time to the next, and what it was lost to.
+
+    Source:
+        CONTRACT section 3, `lost_to`; LOC eq. 8.
+    """
     clock = Clock.at(epochs.t_ns, epochs.t_ns[np.isfinite(epochs.path_m)], config)
     steps_s = np.diff(clock.t_ns, append=clock.t_ns[-1:]) / NS_PER_S
     gap = clock.held_s < steps_s
@@ -96,8 +110,18 @@ def lost_columns(epochs: EpochFigures, config: Configuration) -> LostColumns:
     return LostColumns(steps_s, gap, steps_s * epochs.may_move, steps_s * lost, first)
 
 
-def lost_time(epochs: EpochFigures, lost: LostColumns, alarms: pl.DataFrame, config: Configuration) -> LostTime:
-    """Shares of the moving time."""
+def lost_time(epochs: JudgedEpochs, lost: LostColumns, alarms: pl.DataFrame, config: Configuration) -> LostTime:
+    """Shares of the moving time.
+
+    Args:
+        epochs: of one solution, judged.
+        lost: what their time was lost to.
+        alarms: its rows of `Alarms`.
+        config: the configuration; used is `lds.recovery_s`.
+
+    Returns:
+        The share lost, its causes, and the monitor that failed most.
+    """
     whole_s = float(lost.moving_s.sum())
     if whole_s <= 0.0 or not epochs.moves[:-1].any():
         return LostTime()
@@ -108,14 +132,14 @@ def lost_time(epochs: EpochFigures, lost: LostColumns, alarms: pl.DataFrame, con
     return LostTime(
         share=float(lost.lost_s.sum()) / whole_s,
         causes={cause: parts[cause] for cause in ranked},
-        monitor=_loudest(epochs.table, alarmed),
+        monitor=_loudest(epochs.verdicts, alarmed),
         unfounded=bool(2.0 * lost.lost_s[unexplained].sum() > lost.lost_s[alarmed].sum()),
     )
 
 
-def _causes(epochs: EpochFigures, gap: Bools, config: Configuration) -> dict[LostTo, Bools]:
+def _causes(epochs: JudgedEpochs, gap: Bools, config: Configuration) -> dict[LostTo, Bools]:
     """Conditions in the order in which they apply."""
-    negated = epochs.fail_safe
+    negated = epochs.lds_mode == _FAIL_SAFE
     alarm_ns = np.where(epochs.alarm, epochs.t_ns, np.iinfo(np.int64).min)
     # A monitor fails, or has failed less than `recovery_s` ago (DOMAIN section 4).
     alarmed = np.maximum.accumulate(alarm_ns) >= epochs.t_ns - round(config.lds.recovery_s * NS_PER_S)
@@ -130,7 +154,7 @@ def _causes(epochs: EpochFigures, gap: Bools, config: Configuration) -> dict[Los
         LostTo.SLIP: slip,
         LostTo.RELINK: relink | (negated & ~alarmed),
         LostTo.ALARM: negated,
-        LostTo.NO_ODOMETER: epochs.without_odometer,
+        LostTo.NO_ODOMETER: epochs.odometer_reason != NO_REASON,
     }
 
 
@@ -144,13 +168,11 @@ def _explained(alarms: pl.DataFrame, t_ns: Ints, recovery_s: float) -> Bools:
     return inside
 
 
-def _loudest(epochs: pl.DataFrame, alarmed: Bools) -> str | None:
+def _loudest(verdicts: Mapping[str, Verdicts], alarmed: Bools) -> str | None:
     """The monitor that failed in most of these epochs."""
     if not alarmed.any():
         return None
-    counts = {
-        name: int((truths(epochs[f"{name}_state"] == MonitorState.FAIL.value) & alarmed).sum()) for name in MONITORS
-    }
+    counts = {name: int((verdicts[name].fails & alarmed).sum()) for name in MONITORS}
     loudest = max(counts, key=lambda name: counts[name])
     return loudest if counts[loudest] else None
 
@@ -181,9 +203,9 @@ class InUse:
         return min(1.0, part_s / self.moving_s) if self.moving_s else 0.0
 
 
-def in_use_of(epochs: EpochFigures, moving_s: float) -> InUse:
+def in_use_of(epochs: JudgedEpochs, moving_s: float) -> InUse:
     """Of the judged epochs; `moving_s`: moving time."""
-    known = (epochs.judgement >= 0) & ~epochs.is_judged(Judgement.UNKNOWN)
+    known = epochs.judgements.is_judged
     inside = np.logical_or.accumulate(known) & np.logical_or.accumulate(known[::-1])[::-1]
     used_s = epochs.used_s * (epochs.in_use & epochs.may_move)
     parts = (np.ones_like(known), ~known & ~inside, ~known & inside)

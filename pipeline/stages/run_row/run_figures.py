@@ -4,13 +4,16 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Mapping, Sequence
+from functools import cache
 from typing import Any
 
 import numpy as np
 import polars as pl
 
 from pipeline.stages.epochs.clock import Clock, availability, outages_s, share_of_time, uptime
+from pipeline.stages.judge.failures import Failure as PositionFailure
 from pipeline.stages.judge.failures import within_budget
+from pipeline.stages.judge.judged import JudgedEpochs
 from pipeline.stages.run_row.bounds import (
     CONTINUITY_S,
     UNKNOWN,
@@ -20,10 +23,9 @@ from pipeline.stages.run_row.bounds import (
     poisson_rate,
 )
 from schemas import enums
-from schemas.arrays import NS_PER_S, Bools, Floats, Ints, truths
-from schemas.config import Configuration
+from schemas.arrays import NS_PER_S, Bools, Floats, Ints, median
+from schemas.config import Configuration, HazardConfig
 from schemas.enums import TRUTH, Judgement, PassageStatus, Reason, RunVerdict, ThrVerdict
-from schemas.stages import EpochFigures
 from schemas.tables import SCALES
 
 RunRow = Mapping[str, Any]
@@ -62,10 +64,19 @@ LEVEL_LISTS = {
 _OF_LEVEL = {RunVerdict.UNSAFE: ThrVerdict.EXCEEDED, RunVerdict.UNPROVEN: ThrVerdict.UNKNOWN}
 
 
-def reasons_of(run: RunRow, allowed_s: float, undiagnosed_share: float) -> list[Reason]:
-    """Why a run has its verdict, by the columns `DECISIVE` of its row (DOMAIN section 5.4).
+def reasons_of(run: RunRow, allowed_s: float, hazards: HazardConfig) -> list[Reason]:
+    """Why a run has its verdict.
 
-    `allowed_s`: allowed T_D; `undiagnosed_share`: of the configuration.
+    Args:
+        run: its row, or the columns `DECISIVE` of it.
+        allowed_s: allowed T_D [s].
+        hazards: limits of the configuration.
+
+    Returns:
+        All reasons that apply, in the order of the enumeration.
+
+    Source:
+        DOMAIN section 5.4.
     """
     failures = failures_in(run)
     within, beyond = level_counts(failures, allowed_s)
@@ -78,7 +89,7 @@ def reasons_of(run: RunRow, allowed_s: float, undiagnosed_share: float) -> list[
         Reason.ACCEPTED_UNKNOWN: run["unproven_accepted"] > 0,
         Reason.BUDGET_UNKNOWN: within + beyond < len(failures),
         Reason.UNKNOWN_IN_USE: (run["unknown_in_use_s"] or 0.0) > allowed_s,
-        Reason.NOT_DIAGNOSED: (run["share_undiagnosed"] or 0.0) > undiagnosed_share,
+        Reason.NOT_DIAGNOSED: (run["share_undiagnosed"] or 0.0) > hazards.undiagnosed_share,
         Reason.NOTHING_ACCEPTED: run["balises_accepted"] == 0,
         **{reason: reason in (run["reasons"] or ()) for reason in _LASTING},
     }
@@ -89,7 +100,17 @@ def reasons_of(run: RunRow, allowed_s: float, undiagnosed_share: float) -> list[
 
 
 def verdict_of(reasons: Iterable[Reason]) -> RunVerdict:
-    """The worst that applies; an assumed clock alone changes nothing (DOMAIN section 5.4)."""
+    """The worst that applies; an assumed clock alone changes nothing.
+
+    Args:
+        reasons: why a run is not safe.
+
+    Returns:
+        The verdict of the run.
+
+    Source:
+        DOMAIN section 5.4.
+    """
     against = set(reasons) - {Reason.CLOCK_ASSUMED}
     if against & _UNSAFE:
         return RunVerdict.UNSAFE
@@ -97,14 +118,25 @@ def verdict_of(reasons: Iterable[Reason]) -> RunVerdict:
 
 
 def level_rows(run: RunRow, config: Configuration) -> list[dict[str, object]]:
-    """One `runs` row against the allowed T_D of each service level, by the rules of the run's verdict."""
+    """One `runs` row against the allowed T_D of each service level, by the rules of the run's verdict.
+
+    Args:
+        run: the row by its columns.
+        config: the configuration; used are `safety` and `hazards`.
+
+    Returns:
+        By service level its allowed time [s], failures within and beyond it, and the verdict.
+
+    Source:
+        TVB eq. 7.
+    """
     failures = failures_in(run)
     in_time = ThrVerdict.KEPT if failures else ThrVerdict.NO_FAILURE
     rows: list[dict[str, object]] = []
     for level in config.safety.service_levels:
         allowed_s = config.safety.allowed_time_to_detect_s(level)
         within, exceeded = level_counts(failures, allowed_s)
-        verdict = verdict_of(reasons_of(run, allowed_s, config.hazards.undiagnosed_share))
+        verdict = verdict_of(reasons_of(run, allowed_s, config.hazards))
         values = (level, allowed_s, within, exceeded, _OF_LEVEL.get(verdict, in_time).value)
         rows.append(dict(zip(LEVEL_LISTS, values, strict=True)))
     return rows
@@ -125,21 +157,20 @@ def level_counts(failures: Sequence[Failure], allowed_s: float) -> tuple[int, in
 Row = dict[str, Any]
 
 
-def positions(epochs: EpochFigures, clock: Clock, config: Configuration) -> Row:
+def positions(epochs: JudgedEpochs, clock: Clock, config: Configuration) -> Row:
     """Availability, outages and continuity (CONTRACT section 3; LOC eq. 8).
 
     Time of which nobody knows whether the train moved counts as moving, and a TVB in it does not (DOMAIN section 5.5).
     """
     lost_s = outages_s(clock.t_ns, epochs.usable, clock.limit_s)
     share = availability(clock.t_ns, epochs.valid, epochs.may_move, clock.limit_s)
-    trusted = epochs.usable & epochs.confident(config.lds.ci_limit_m) & epochs.unambiguous
-    trust = uptime(clock.t_ns, trusted, clock.limit_s)
+    trust = uptime(clock.t_ns, epochs.trusted(config.lds), clock.limit_s)
     mtbf_h = trust.up_s / trust.losses / 3600.0 if trust.losses and trust.up_s > 0 else None
     return {
         "availability": share if epochs.moves[:-1].any() else None,
         "outages": lost_s.size,
         "longest_outage_s": float(lost_s.max(initial=0.0)) if epochs.height else None,
-        "cross_bias_m": epochs.table["cross_track_m"].filter(epochs.table["on_track"]).median(),
+        "cross_bias_m": _median_m(epochs.cross_track_m[epochs.on_track]),
         "mtbf_h": mtbf_h,
         "continuity_15s": continuity(CONTINUITY_S, mtbf_h) if mtbf_h else None,
         "trusted_s": trust.up_s if epochs.height else None,
@@ -147,27 +178,33 @@ def positions(epochs: EpochFigures, clock: Clock, config: Configuration) -> Row:
     }
 
 
+def _median_m(values_m: Floats) -> float | None:
+    """Of those that are known; None without any."""
+    known_m = values_m[np.isfinite(values_m)]
+    return median(known_m) if known_m.size else None
+
+
 def judged() -> pl.Expr:
     """The evidence calls the position right or wrong (DOMAIN section 5.2)."""
     return pl.col("judgement").is_in([Judgement.RIGHT, Judgement.WRONG])
 
 
-def time_in_use(epochs: EpochFigures, recovery_s: float) -> Row:
+def time_in_use(epochs: JudgedEpochs, recovery_s: float) -> Row:
     """Time in use, and what of it nobody can judge or nothing diagnoses (DOMAIN section 5.4); all null without epochs.
 
     Shares are of the moving time in use, null without any.
     """
     used_s = epochs.used_s
     moves = epochs.may_move
-    seen = epochs.judged
+    judged_rows = epochs.judgements.is_judged
     negated_s = epochs.counted_s[epochs.negated]
     figures = {
         "in_use_s": float(used_s.sum()),
-        "in_use_judged_s": float(used_s[seen].sum()),
+        "in_use_judged_s": float(used_s[judged_rows].sum()),
         "negated_s": float(negated_s.sum()),
-        "share_unknown": share_of_time(used_s[moves], ~seen[moves]),
+        "share_unknown": share_of_time(used_s[moves], ~judged_rows[moves]),
         "share_undiagnosed": share_of_time(used_s[moves], epochs.undiagnosed[moves]),
-        "unknown_in_use_s": _longest_s(epochs.t_ns, used_s, ~seen & moves & (used_s > 0.0), recovery_s),
+        "unknown_in_use_s": _longest_s(epochs.t_ns, used_s, ~judged_rows & moves & (used_s > 0.0), recovery_s),
     }
     return figures if epochs.height else dict.fromkeys(figures)
 
@@ -179,10 +216,10 @@ def _longest_s(t_ns: Ints, used_s: Floats, where: Bools, apart_s: float) -> floa
     return max(float(used_s[part].sum()) for part in np.split(rows, breaks))
 
 
-def proof_margin_m(epochs: EpochFigures, passages: pl.DataFrame, limit_m: float) -> float | None:
+def proof_margin_m(epochs: JudgedEpochs, passages: pl.DataFrame, limit_m: float) -> float | None:
     """Least proof margin of the epochs in use and the acceptances that are right [m] (DOMAIN section 5.2)."""
-    right = epochs.is_judged(Judgement.RIGHT) & epochs.in_use
-    margins_m = limit_m - np.fmax(-epochs.error_low_m[right], epochs.error_high_m[right])
+    right = epochs.judgements.is_right & epochs.in_use
+    margins_m = limit_m - np.fmax(-epochs.judgements.low_m[right], epochs.judgements.high_m[right])
     of_epochs = margins_m[np.isfinite(margins_m)].min(initial=np.inf)
     of_passages = passages.filter(accepted())["proof_margin_m"].min()
     margins = [float(of_epochs)] if np.isfinite(of_epochs) else []
@@ -201,11 +238,12 @@ def spread(error: pl.Expr, name: str, counted: str) -> dict[str, pl.Expr]:
     }
 
 
-def accuracy(epochs: EpochFigures) -> Row:
+def accuracy(epochs: JudgedEpochs) -> Row:
     errors: dict[str, pl.Expr] = {}
     for axis in ("along", "cross", "up"):
-        errors |= spread(pl.col(f"error_{axis}_m"), f"{axis}_error", "epochs")
-    return epochs.table.select(**errors).row(0, named=True)
+        errors |= spread(pl.col(axis), f"{axis}_error", "epochs")
+    known_m = {"along": epochs.error_along_m, "cross": epochs.error_cross_m, "up": epochs.error_up_m}
+    return pl.DataFrame(known_m, nan_to_null=True).select(**errors).row(0, named=True)
 
 
 def accepted() -> pl.Expr:
@@ -241,11 +279,20 @@ def _wrong() -> pl.Expr:
 def balise_counts(passages: pl.DataFrame) -> Row:
     """What became of the virtual balises, and of those accepted what the judge says of their positions."""
     virtual = passages.filter(pl.col("kind") == enums.BaliseKind.VIRTUAL)
-    counts = {"balises_on_path": is_passage(), **{f"balises_{name}": met for name, met in outcomes().items()}}
-    errors = spread(pl.col("location_error_m").filter(accepted()), "location_error", "count")
+    return virtual.select(**_of_balises()).row(0, named=True)
+
+
+@cache
+def _of_balises() -> dict[str, pl.Expr]:
+    """Columns of `runs` over the passages of virtual balises."""
+    counts = {"balises_on_path": is_passage()}
+    counts |= {f"balises_{name}": becomes for name, becomes in outcomes().items()} | acceptances()
     each_once = {"balises_passed": is_passage(), "balises_found": is_passage() & accepted()}
-    once = {name: virtual.filter(condition)["balise_id"].n_unique() for name, condition in each_once.items()}
-    return _count_rows(virtual, counts | acceptances()) | virtual.select(**errors).row(0, named=True) | once
+    return {
+        **{name: condition.sum() for name, condition in counts.items()},
+        **spread(pl.col("location_error_m").filter(accepted()), "location_error", "count"),
+        **{name: pl.col("balise_id").filter(condition).n_unique() for name, condition in each_once.items()},
+    }
 
 
 def _count_rows(frame: pl.DataFrame, conditions: Mapping[str, pl.Expr]) -> Row:
@@ -273,17 +320,25 @@ def hazard_counts(hazards: pl.DataFrame) -> Row:
     return _count_rows(hazards, counts) | of_faults | {f"{name}_max_s": hazards[f"{name}_s"].max() for name in times}
 
 
-def failure_counts(failures: pl.DataFrame) -> Row:
-    """Every failure counts, whether it hit a VB or not (DOMAIN section 5.3); frame as in `schemas.stages.Failures`."""
-    counts = {"failures_within_budget": pl.col("within_budget"), "failures_beyond_budget": ~pl.col("within_budget")}
+def failure_counts(failures: Sequence[PositionFailure]) -> Row:
+    """Every failure counts, whether it hit a VB or not (DOMAIN section 5.3)."""
+    within = [failure.within_budget for failure in failures]
+    hazardous_s = [failure.hazardous_s for failure in failures]
     return {
-        "failures": failures.height,
-        **_count_rows(failures, counts),
-        "hazardous_max_s": failures["hazardous_s"].max(),
-        "hazardous_s": failures["hazardous_s"].sum(),
-        "hazardous_natural_s": failures["natural_s"].sum(),
-        **{f"failure_{name}": failures[name].to_list() for name in ("hazardous_s", "hazardous_may_s", "accepted")},
+        "failures": len(failures),
+        "failures_within_budget": within.count(True),
+        "failures_beyond_budget": within.count(False),
+        "hazardous_max_s": max(hazardous_s, default=None),
+        "hazardous_s": _sum_s(hazardous_s),
+        "hazardous_natural_s": _sum_s([failure.natural_s for failure in failures]),
+        "failure_hazardous_s": hazardous_s,
+        "failure_hazardous_may_s": [failure.hazardous_may_s for failure in failures],
+        "failure_accepted": [failure.accepted.value for failure in failures],
     }
+
+
+def _sum_s(times_s: Sequence[float]) -> float:
+    return float(pl.Series(times_s, dtype=pl.Float64).sum())
 
 
 def service_levels(row: Row, config: Configuration) -> Row:
@@ -292,25 +347,23 @@ def service_levels(row: Row, config: Configuration) -> Row:
     return {name: [level[part] for level in rows] for part, name in LEVEL_LISTS.items()}
 
 
-def alarm_counts(alarms: pl.DataFrame, epochs: EpochFigures, evidence: enums.Evidence | None) -> Row:
+def alarm_counts(alarms: pl.DataFrame, epochs: JudgedEpochs, evidence: enums.Evidence | None) -> Row:
     """Alarms and the rate of false ones, which needs a reference or balise reads and a verdict on every alarm.
 
     The rate counts the time in use in which the along-track bank judged and the position was judged (DOMAIN 6).
     """
     false = alarms.filter(pl.col("verdict") == enums.Verdict.FALSE).height
-    states = [epochs.table[f"along_{scale}_state"] for scale in SCALES]
-    evaluated = [truths(state != enums.MonitorState.NOT_EVALUATED.value) for state in states]
-    monitored: Bools = np.logical_or.reduce(evaluated)
-    seen = epochs.judged
+    monitored: Bools = np.logical_or.reduce([epochs.verdicts[f"along_{scale}"].evaluated for scale in SCALES])
+    judged_rows = epochs.judgements.is_judged
     counted_s = epochs.counted_s
-    judged_s = counted_s[monitored & seen & epochs.in_use]
+    judged_s = counted_s[monitored & judged_rows & epochs.in_use]
     times = {
         "held_s": counted_s,
         "monitored_s": counted_s[monitored],
-        "evidence_s": counted_s[seen],
+        "evidence_s": counted_s[judged_rows],
         "judged_s": judged_s,
     }
-    truth = evidence in TRUTH and bool(seen.any())
+    truth = evidence in TRUTH and bool(judged_rows.any())
     complete = truth and not (alarms["verdict"] == enums.Verdict.UNKNOWN).any()
     rate = poisson_rate(false, float(judged_s.sum()) / 3600.0) if complete else UNKNOWN
     return {
@@ -321,15 +374,15 @@ def alarm_counts(alarms: pl.DataFrame, epochs: EpochFigures, evidence: enums.Evi
     }
 
 
-def exposure(epochs: EpochFigures) -> Row:
-    exposure_s = epochs.table["exposure_s"]
+def exposure(epochs: JudgedEpochs) -> Row:
+    exposure_s = pl.Series(epochs.exposure_s, nan_to_null=True)
     return {
         "exposure_max_s": exposure_s.max(),
         "exposure_p99_s": exposure_s.quantile(0.99, interpolation="linear"),
     }
 
 
-def state_shares(epochs: EpochFigures) -> Row:
+def state_shares(epochs: JudgedEpochs) -> Row:
     """Share of the time, without gaps, in which each state of the LDS is known to hold (TVB section 4).
 
     The time in P1 is the hazardous time of all failures. While the state is unknown no share grows, so the four may add
@@ -345,7 +398,7 @@ def state_shares(epochs: EpochFigures) -> Row:
     return row
 
 
-def stanford_counts(epochs: EpochFigures, bound_m: Floats, limit_m: float) -> Row:
+def stanford_counts(epochs: JudgedEpochs, bound_m: Floats, limit_m: float) -> Row:
     """Epochs whose error is known to 5 m, by error and bound along the track (CONTRACT section 3, `stanford_*`)."""
     known = np.isfinite(epochs.error_along_m) & np.isfinite(bound_m)
     error_m = np.abs(epochs.error_along_m[known])
@@ -360,7 +413,7 @@ def stanford_counts(epochs: EpochFigures, bound_m: Floats, limit_m: float) -> Ro
     return {f"stanford_{name}": int(condition.sum()) for name, condition in counts.items()}
 
 
-def stanford_of_receiver(epochs: EpochFigures, limit_m: float) -> Row:
+def stanford_of_receiver(epochs: JudgedEpochs, limit_m: float) -> Row:
     """The same counts with the receiver's protection level as bound; not known where it gives none."""
     counts = stanford_counts(epochs, epochs.hpl_m, limit_m) if np.isfinite(epochs.hpl_m).any() else {}
     return {f"stanford_hpl_{name.removeprefix('stanford_')}": value for name, value in counts.items()}

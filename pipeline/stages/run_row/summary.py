@@ -14,8 +14,9 @@ import polars as pl
 from pipeline.stages.epochs.clock import Clock
 from pipeline.stages.epochs.verdicts import NUMBER, Verdicts
 from pipeline.stages.evidence import TrainEvidence
-from pipeline.stages.judge.failures import failures_within
+from pipeline.stages.judge.failures import Failure, failures_within
 from pipeline.stages.judge.judge import Judged
+from pipeline.stages.judge.judged import JudgedEpochs
 from pipeline.stages.matching.epochs import contradictory_covariances
 from pipeline.stages.monitored import MonitoredSolution
 from pipeline.stages.odometry import Odometry
@@ -54,7 +55,6 @@ from schemas.enums import (
 )
 from schemas.frozen import frozen
 from schemas.run import IngestNotes, RunLog
-from schemas.stages import EpochFigures
 from schemas.tables import CONTRACT_VERSION, Runs
 from schemas.words import Remark, notes_text, remarks, remedy_words, say
 
@@ -156,25 +156,27 @@ def judged_notes(run: Mapping[str, Any]) -> list[Remark]:
     )
 
 
-def undiagnosed_notes(epochs: EpochFigures, passages: pl.DataFrame) -> list[Remark]:
+def undiagnosed_notes(epochs: JudgedEpochs, passages: pl.DataFrame) -> list[Remark]:
     """Virtual balises that were accepted while no odometer could contradict the position."""
     accepted = (pl.col("kind") == BaliseKind.VIRTUAL.value) & (pl.col("status") == PassageStatus.ACCEPTED.value)
     offers = passages.filter(accepted).drop_nulls("t_offered")
     # The first epoch at or after each offer.
     epoch = np.searchsorted(epochs.t_ns, times_ns(offers, "t_offered"))
-    reasons = epochs.table["along_raw_reason"].gather(epoch[epoch < epochs.height])
-    counts = {reason: (reasons == reason.value).sum() for reason in _WITHOUT_ODOMETER}
+    reasons = epochs.verdicts["along_raw"].reason[epoch[epoch < epochs.height]]
+    counts = {reason: int((reasons == NUMBER[reason]).sum()) for reason in _WITHOUT_ODOMETER}
     return [Remark(Note.UNDIAGNOSED, (count, reason.value)) for reason, count in counts.items() if count]
 
 
-def in_use_notes(epochs: EpochFigures) -> list[Remark]:
-    """Epochs in use at which no figure bounds a fault still in use; nothing where none was computed."""
-    used = epochs.in_use & epochs.table["undetected_ahead_m"].is_not_null().to_numpy()
-    unbounded = int((used & epochs.table["undetected_ahead_in_use_m"].is_null().to_numpy()).sum())
+def in_use_notes(epochs: JudgedEpochs, undetected: pl.DataFrame) -> list[Remark]:
+    """Epochs in use at which no figure bounds a fault still in use; `undetected`: columns of `epochs`, null where
+    nothing was computed.
+    """
+    used = epochs.in_use & undetected["undetected_ahead_m"].is_not_null().to_numpy()
+    unbounded = int((used & undetected["undetected_ahead_in_use_m"].is_null().to_numpy()).sum())
     return remarks({Note.IN_USE_UNBOUNDED: (unbounded, int(used.sum())) if unbounded else None})
 
 
-def time_notes(epochs: EpochFigures, clock: Clock, lost: LostTime, config: Configuration) -> list[Remark]:
+def time_notes(epochs: JudgedEpochs, clock: Clock, lost: LostTime, config: Configuration) -> list[Remark]:
     """For how long nobody knows whether the train moved, and what the moving time without a valid TVB was lost to."""
     unknown_s = float(clock.held_s[epochs.may_move & ~epochs.moves].sum())
     low = lost.share is not None and 1.0 - lost.share < config.advice.low_availability
@@ -191,16 +193,17 @@ Row = dict[str, Any]
 
 @frozen
 class SolutionResults:
-    """What the stages say of one solution; `lost`: of each of `epochs`, `columns` of `runs` as they stand there.
+    """What the stages say of one solution.
 
-    `reasons`: those that no figure holds; `anchored_ns`: first and last instant at which a read or the reference says
-    where the train was; `clock_open_s`: over how long the clocks of the recorders leave the instant open.
+    `lost`, `undetected`: of each epoch; `columns`: of `runs`, as they stand there; `reasons`: those that no figure
+    holds; `anchored_ns`: first and last instant at which a read or the reference says where the train was;
+    `clock_open_s`: over how long the clocks of the recorders leave the instant open.
     """
 
     solution: str
-    epochs: EpochFigures
     lost: LostColumns
     judged: Judged
+    undetected: pl.DataFrame
     columns: Mapping[str, object]
     ingest: IngestNotes = field(default_factory=IngestNotes)
     notes: Sequence[Remark] = ()
@@ -210,8 +213,20 @@ class SolutionResults:
 
 
 def summarise(results: SolutionResults, config: Configuration, provenance: Provenance) -> pl.DataFrame:
-    """One row of the `runs` table (CONTRACT section 3)."""
-    epochs = results.epochs
+    """One row of the `runs` table.
+
+    Args:
+        results: what the stages say of one solution.
+        config: the configuration; used are limits, service levels and advice.
+        provenance: digests and software.
+
+    Returns:
+        One row of `schemas.tables.Runs`.
+
+    Source:
+        CONTRACT section 3; DOMAIN section 5.4.
+    """
+    epochs = results.judged.epochs
     clock = Clock.at(epochs.t_ns, epochs.t_ns[np.isfinite(epochs.path_m)], config)
     judged = results.judged
     lost = lost_time(epochs, results.lost, judged.alarms, config)
@@ -232,7 +247,7 @@ def summarise(results: SolutionResults, config: Configuration, provenance: Prove
         | _provenance(provenance)
     )
     row |= _part(results, row, config) | service_levels(row, config) | _verdict(row, config)
-    stated = bool(epochs.table["survey_sigma_m"].count())
+    stated = bool(np.isfinite(epochs.survey_sigma_m).any())
     clock_open_m = results.clock_open_s * float(np.abs(np.nan_to_num(epochs.speed_mps)).max(initial=0.0))
     cures = remedies(row, lost, in_use_of(epochs, float(results.lost.moving_s.sum())), stated, config, clock_open_m)
     noted = (
@@ -240,7 +255,7 @@ def summarise(results: SolutionResults, config: Configuration, provenance: Prove
         *results.notes,
         *judged_notes(row),
         *undiagnosed_notes(epochs, judged.passages),
-        *in_use_notes(epochs),
+        *in_use_notes(epochs, results.undetected),
         *time_notes(epochs, clock, lost, config),
         *(Remark(Note.REMEDY, (remedy_words(cure, gain),)) for cure, gain in cures.items()),
     )
@@ -263,7 +278,7 @@ def _identity(results: SolutionResults) -> Row:
     }
 
 
-def _decisive(epochs: EpochFigures, passages: pl.DataFrame, failures: pl.DataFrame, config: Configuration) -> Row:
+def _decisive(epochs: JudgedEpochs, passages: pl.DataFrame, failures: Sequence[Failure], config: Configuration) -> Row:
     """What decides the verdict of a run, or of a part of it (`reasons_of`)."""
     return {
         **time_in_use(epochs, config.lds.recovery_s),
@@ -274,7 +289,7 @@ def _decisive(epochs: EpochFigures, passages: pl.DataFrame, failures: pl.DataFra
 
 
 def _verdict(row: Row, config: Configuration) -> Row:
-    reasons = reasons_of(row, config.budget_s, config.hazards.undiagnosed_share)
+    reasons = reasons_of(row, config.budget_s, config.hazards)
     return {"verdict": verdict_of(reasons), "reasons": reasons}
 
 
@@ -283,17 +298,18 @@ def _part(results: SolutionResults, row: Row, config: Configuration) -> Row:
     if results.anchored_ns is None:
         return {}
     from_ns, to_ns = results.anchored_ns
-    epochs = results.epochs
+    epochs = results.judged.epochs
     inside = (epochs.at_ns >= from_ns) & (epochs.at_ns <= to_ns)
     whole_s = float(pl.Series(epochs.counted_s[epochs.may_move]).sum())
     share = float(pl.Series(epochs.counted_s[epochs.may_move & inside]).sum()) / whole_s if whole_s else 0.0
     if not 0.0 < share < 1.0:
         return {}
-    part = epochs.where(inside)
     rows = np.flatnonzero(inside)
-    offers = results.judged.offers.filter(pl.col("epoch").is_between(int(rows[0]), int(rows[-1])))
-    passages = results.judged.passages.join(offers.select("crossing_id"), on="crossing_id", how="semi")
-    decisive = _decisive(part, passages, failures_within(part.table, offers, config), config)
+    part = epochs.where(rows)
+    of_part = (results.judged.offers.epoch >= rows[0]) & (results.judged.offers.epoch <= rows[-1])
+    offers = results.judged.offers.where(np.flatnonzero(of_part))
+    passages = results.judged.passages.filter(pl.col("crossing_id").is_in(offers.crossing_id.tolist()))
+    decisive = _decisive(part, passages, failures_within(part, offers, config), config)
     verdict = _verdict(row | decisive | {"duration_s": (to_ns - from_ns) / NS_PER_S}, config)["verdict"]
     return {"part_verdict": verdict, "part_from": from_ns, "part_to": to_ns, "part_share": share}
 
@@ -314,7 +330,7 @@ def _frame(row: Mapping[str, object]) -> pl.DataFrame:
     return pl.DataFrame([values], schema=schema)
 
 
-def _extent(epochs: EpochFigures, clock: Clock, lost: LostColumns) -> Row:
+def _extent(epochs: JudgedEpochs, clock: Clock, lost: LostColumns) -> Row:
     begin_ns, end_ns = epochs.t_ns[[0, -1]].tolist() if epochs.height else (None, None)
     return {
         "t_start": begin_ns,

@@ -1,6 +1,6 @@
-"""How far the chords of a survey may lie beside the curve that they stand for.
+"""How far the chords of a survey may lie off the curve that they stand for.
 
-A chord of length L between two points of an arc, at each of which the line turns by Δθ, lies up to L Δθ / 8 beside it,
+A chord of length L between two points of an arc, at each of which the line turns by Δθ, lies up to L Δθ / 8 off it,
 on the mean two thirds of that. Half of it counts as sigma: twice its variance is that of the mean, and three cover it.
 """
 
@@ -42,7 +42,7 @@ class Chords:
         unknown = vertex[np.isnan(self._known_m[vertex])]
         for element in np.unique(np.searchsorted(self.track.first, unknown, side="right") - 1).tolist():
             if np.isnan(self._known_m[self.track.first[element]]):
-                self._look_at(_chain_through(element, self._after))
+                self._measure_chain(_chain_through(element, self._after))
         return self._known_m[vertex]
 
     @cached_property
@@ -54,6 +54,7 @@ class Chords:
 
     @cached_property
     def _known_m(self) -> Floats:
+        """Projections worked out so far, by vertex; not a number where none is yet [m]."""
         return np.full(len(self.track.measure_m), np.nan)
 
     @cached_property
@@ -69,12 +70,13 @@ class Chords:
 
     @cached_property
     def _after(self) -> Ints:
-        """The oriented element that is the straightest way on from each, if that is the straightest way back too."""
+        """The straightest successor of each oriented element, if it is its straightest predecessor too."""
         onward, _ = self._onward
+        # `oriented ^ 1` is the same element run in the other direction.
         back = onward[onward ^ 1] == np.arange(len(onward)) ^ 1
         return np.where((onward >= 0) & back, onward, -1)
 
-    def _look_at(self, chain: list[int]) -> None:
+    def _measure_chain(self, chain: list[int]) -> None:
         """Work out the segments of a chain of elements."""
         vertex, against = _vertices(self.track, chain)
         length_m, heading_rad = _segments(self.track, vertex)
@@ -88,13 +90,13 @@ class Chords:
 
 
 def _segments(track: SurveyedTrack, vertex: Ints) -> tuple[Floats, Floats]:
-    """Length [m] of the segment that begins at each vertex, and its heading [rad] as seen from its start and end."""
+    """Length [m] of the segment that begins at each vertex, and its heading [rad] at its start and at its end."""
     along = track.surface[vertex + 1] - track.surface[vertex]
     x_m, y_m, z_m = along.T
     headings = []
-    for seen_from in (vertex, vertex + 1):
-        sin_lat, cos_lat, sin_lon, cos_lon = sines(track.latitude_deg[seen_from], track.longitude_deg[seen_from])
-        # The way along the unit vectors east and north there (`geodesy.points_of`).
+    for viewpoint in (vertex, vertex + 1):
+        sin_lat, cos_lat, sin_lon, cos_lon = sines(track.latitude_deg[viewpoint], track.longitude_deg[viewpoint])
+        # The segment on the unit vectors east and north there (`geodesy.points_of`).
         east_m = x_m * -sin_lon + y_m * cos_lon
         north_m = x_m * (-sin_lat * cos_lon) + y_m * (-sin_lat * sin_lon) + z_m * cos_lat
         headings.append(np.arctan2(east_m, north_m))
@@ -102,6 +104,11 @@ def _segments(track: SurveyedTrack, vertex: Ints) -> tuple[Floats, Floats]:
 
 
 def _straightest(leave_rad: Floats, enter_rad: Floats, here: Ints, there: Ints) -> tuple[Ints, Floats]:
+    """Successor of each oriented element with the least turn, -1 without one, and that turn [rad].
+
+    `leave_rad`, `enter_rad`: heading at the exit and the entry of each; `here`, `there`: pairs of successors.
+    """
+    # Sorted by element, then by turn: the first row of each element is its straightest successor.
     turns_rad = _wrapped(enter_rad[there] - leave_rad[here])
     order = np.lexsort((np.abs(turns_rad), here))
     least = order[np.diff(here[order], prepend=-1) > 0]
@@ -137,25 +144,25 @@ def _vertices(track: SurveyedTrack, chain: Sequence[int]) -> tuple[Ints, Ints]:
     return np.concatenate(parts), np.repeat(np.array(chain) % 2, [len(part) for part in parts])
 
 
-def _sigmas_m(way_m: Floats, turn_rad: Floats) -> Floats:
-    """Of each segment between points of a chain the largest sigma of all chords that it may be a part of.
+def _sigmas_m(distance_m: Floats, turn_rad: Floats) -> Floats:
+    """Largest sigma of all chords that each segment between points of a chain may be a part of [m].
 
     A chord spans 1, 2, ... `points` segments. Its turn is the geometric mean of the turns at its ends (0 with a
     straight at one of them) less the turn within it. Where the chain ends, with the survey or at a switch, its turn is
     unknown: the points there are as far apart as beyond, and so it counts as that of the curve that begins there.
     """
-    bend_rad = _turn_about(way_m, turn_rad)
-    ends_rad = _turn_at_begin(way_m, bend_rad), _turn_at_begin(way_m[-1] - way_m[::-1], bend_rad[::-1])
+    bend_rad = _turn_about(distance_m, turn_rad)
+    ends_rad = _turn_at_begin(distance_m, bend_rad), _turn_at_begin(distance_m[-1] - distance_m[::-1], bend_rad[::-1])
     bend_rad[[0, -1]] = np.maximum(bend_rad[[0, -1]], ends_rad)
     inside_rad = np.cumsum(np.abs(turn_rad))
-    last = len(way_m) - 1
+    last = len(distance_m) - 1
     out = np.zeros(last)
     begin = np.arange(last)
     points = 0
     while len(begin):
         points += 1
         end = begin + points
-        length_m = way_m[end] - way_m[begin]
+        length_m = distance_m[end] - distance_m[begin]
         turn = np.sqrt(bend_rad[begin] * bend_rad[end]) - (inside_rad[end - 1] - inside_rad[begin])
         sigma_m = length_m * np.minimum(turn, np.pi) / 16.0
         if points > 1:
@@ -169,15 +176,15 @@ def _sigmas_m(way_m: Floats, turn_rad: Floats) -> Floats:
     return out
 
 
-def _turn_about(way_m: Floats, turn_rad: Floats) -> Floats:
-    """Turn at each point together with those beside it."""
+def _turn_about(distance_m: Floats, turn_rad: Floats) -> Floats:
+    """Turn at each point together with those within `_ONE_POINT_M` of it [rad]."""
     turned = np.cumsum(np.append(0.0, turn_rad))
-    low = np.searchsorted(way_m, way_m - _ONE_POINT_M)
-    high = np.searchsorted(way_m, way_m + _ONE_POINT_M, side="right")
+    low = np.searchsorted(distance_m, distance_m - _ONE_POINT_M)
+    high = np.searchsorted(distance_m, distance_m + _ONE_POINT_M, side="right")
     return np.asarray(np.abs(turned[high] - turned[low]))
 
 
-def _turn_at_begin(way_m: Floats, bend_rad: Floats) -> float:
+def _turn_at_begin(distance_m: Floats, bend_rad: Floats) -> float:
     """Turn [rad] at the first point of a chain, by those after it.
 
     A point turns by half of the arc before it and half of that after it; the arc after it has the curvature of the next
@@ -186,12 +193,12 @@ def _turn_at_begin(way_m: Floats, bend_rad: Floats) -> float:
     """
     # Smaller turns are none: points on a chord.
     turns = np.flatnonzero(bend_rad[1:-1] > 16.0 * _LEAST_M / _LONGEST_CUT_M)[:3] + 1
-    if not turns.size or way_m[turns[0]] > _LONGEST_CUT_M:
+    if not turns.size or distance_m[turns[0]] > _LONGEST_CUT_M:
         return 0.0
     own_rad = float(bend_rad[turns[0]])
     if turns.size < 2:
         return own_rad
-    next_m, after_m = np.diff(way_m[[*turns, -1][:3]])
+    next_m, after_m = np.diff(distance_m[[*turns, -1][:3]])
     arc_rad = float(bend_rad[turns[1]] * next_m / (next_m + after_m))
     return min(own_rad, max(2.0 * (own_rad - arc_rad), 0.0))
 

@@ -1,6 +1,6 @@
 """WGS 84 positions as metres, right over any distance a site may span.
 
-No plane serves a line of 100 km: lengths are chords of the ellipsoid, and everything beside the track is
+No plane serves a line of 100 km: lengths are chords of the ellipsoid, and everything across the track is
 measured in the tangent plane of the point itself.
 """
 
@@ -61,8 +61,15 @@ def steps_m(places: Floats) -> Floats:
     return np.asarray(np.sqrt(np.einsum("ij,ij->i", steps, steps)))
 
 
-def way_m(places: Floats) -> Floats:
-    """Distance of each of some places from the first of them, along the line that they make [m]."""
+def distance_along_m(places: Floats) -> Floats:
+    """Running distance along a polyline.
+
+    Args:
+        places: earth-centred vertices in order [m], shape (n, 3).
+
+    Returns:
+        Distance of each vertex from the first one along the line [m], shape (n,).
+    """
     return np.concatenate([np.zeros(min(1, len(places))), np.cumsum(np.linalg.norm(np.diff(places, axis=0), axis=1))])
 
 
@@ -99,6 +106,7 @@ def sines(latitude_deg: Floats, longitude_deg: Floats) -> tuple[Floats, Floats, 
 
 
 def _ecef(sin_lat: Floats, cos_lat: Floats, sin_lon: Floats, cos_lon: Floats, height_m: Floats) -> Floats:
+    """Earth-fixed coordinates of geodetic ones, on the ellipsoid of WGS 84 [m]."""
     normal_m = SEMI_MAJOR_AXIS_M / np.sqrt(1.0 - ECCENTRICITY_SQUARED * sin_lat * sin_lat)
     ring_m = (normal_m + height_m) * cos_lat
     up_m = (normal_m * (1.0 - ECCENTRICITY_SQUARED) + height_m) * sin_lat

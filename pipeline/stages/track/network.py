@@ -52,7 +52,7 @@ class Once(Generic[Source, Made]):
 
 
 class Edge(NamedTuple):
-    """A way on: successor, gap [m], and whether trains may run it forward and backward."""
+    """A relation to a successor, the gap between both [m], and whether trains may run it forward and backward."""
 
     to: int
     gap_m: float
@@ -62,7 +62,7 @@ class Edge(NamedTuple):
 
 @frozen
 class Onward:
-    """All ways on, as arrays: `first[one] : first[one + 1]` are those from an oriented element, in their order."""
+    """All relations to successors, as arrays: `first[e] : first[e + 1]` are those of element e."""
 
     first: Ints
     to: Ints
@@ -75,7 +75,7 @@ class Onward:
         return len(self.first) - 1
 
     def __getitem__(self, oriented: int) -> tuple[Edge, ...]:
-        """Ways on from one: a run asks for those of few of the elements that a network may have."""
+        """Relations of one element, kept once asked for: a run asks for few of the elements of a network."""
         known = self._known.get(oriented)
         if known is None:
             part = slice(int(self.first[oriented]), int(self.first[oriented + 1]))
@@ -86,7 +86,7 @@ class Onward:
 
     @cached_property
     def here(self) -> Ints:
-        """The oriented element that each way leads on from."""
+        """The oriented element that each relation leads on from."""
         return np.repeat(np.arange(len(self)), np.diff(self.first))
 
 
@@ -114,6 +114,7 @@ class Network:
 
     @cached_property
     def chords(self) -> Chords:
+        """How far its chords lie off their curves."""
         return Chords(self.track, self.successors.here, self.successors.to)
 
     def survey_sigmas_m(self, unstated_m: float, vertex: Ints) -> Floats:
@@ -130,24 +131,26 @@ class Network:
         return float(np.hypot(stated_m, self.chords.most_m))
 
     def _stated_m(self, vertex: Ints, unstated_m: float) -> Floats:
+        """Survey uncertainty of vertices, or another where the survey states none [m]."""
         stated_m = self.track.sigma_m[vertex]
         return np.where(np.isfinite(stated_m), stated_m, unstated_m)
 
     @cached_property
     def connected(self) -> Ints:
-        """Per net element the number of the part that it is connected with, whichever way trains would run."""
+        """Number of the part that each net element is connected with, whatever the direction of trains."""
         return np.asarray(self.parts.reshape(-1, 2).min(axis=1))
 
     @cached_property
     def unbranched(self) -> Ints:
-        """Per net element the number of the line without a branch that it belongs to, however it is cut."""
+        """Number of the line without a branch that each net element belongs to, however it is cut."""
         from scipy.sparse import coo_array
         from scipy.sparse.csgraph import connected_components
 
-        ways = self.successors
-        alone = np.diff(ways.first) == 1
-        joined = alone[ways.here] & alone[ways.to ^ 1]
-        pairs = (ways.here[joined] // 2, ways.to[joined] // 2)
+        onward = self.successors
+        alone = np.diff(onward.first) == 1
+        # Two elements are one line where each is the only one that the other leads on to.
+        joined = alone[onward.here] & alone[onward.to ^ 1]
+        pairs = (onward.here[joined] // 2, onward.to[joined] // 2)
         size = (self.count, self.count)
         _, group = connected_components(coo_array((np.ones(len(pairs[0])), pairs), shape=size), directed=False)
         return np.asarray(group, dtype=np.int64)
@@ -158,15 +161,17 @@ class Network:
         return len(self.track.ids)
 
     def length_m(self, oriented: int) -> float:
+        """Length of an oriented element [m]."""
         return self._lengths_m[oriented // 2]
 
     @cached_property
     def _lengths_m(self) -> list[float]:
+        """Length of each net element, as a list [m]."""
         lengths_m: list[float] = self.track.length_m.tolist()  # searches ask for one at a time
         return lengths_m
 
     def reach(self, oriented: int, limit_m: float) -> dict[int, Reach]:
-        """Everything whose entry lies within `limit_m` beyond the exit of an oriented element, each by its nearest way.
+        """Everything whose entry lies within `limit_m` beyond the exit of an oriented element, by the shortest route.
 
         An element is reached from itself over a loop.
         """
@@ -186,23 +191,23 @@ class Network:
         return known[1]
 
     def linked(self, first: int, second: int) -> bool:
-        """Whether one is a direct successor of the other, either way round."""
+        """Whether one is a direct successor of the other, in either order."""
         return any(
             edge.to == there for here, there in ((first, second), (second, first)) for edge in self.successors[here]
         )
 
-    def way(self, here: int, to: int) -> Edge:
-        """The way from an oriented element to a successor."""
+    def edge(self, here: int, to: int) -> Edge:
+        """The relation from an oriented element to a successor."""
         return next(edge for edge in self.successors[here] if edge.to == to)
 
     def linked_ends(self) -> Bools:
-        """Per element, whether a relation leads on from its start and from its end."""
+        """Whether a relation leads on from each element's start and from its end."""
         onward = np.diff(self.successors.first) > 0
         return onward.reshape(-1, 2)[:, ::-1]
 
 
 # Numerics: searches go at least so far, so that one of them answers for several. What is found farther away than asked
-# competes by its length as every way does.
+# competes by its length as every route does.
 MIN_REACH_M = 150.0
 
 
@@ -213,15 +218,15 @@ def network_of(track: SurveyedTrack, links: pl.DataFrame) -> Network:
     element_b, position_b = _linked_ends(track, usable_links, "b")
     ends = end_places(track)
     gap_m = gaps_m(ends[element_a, position_a], ends[element_b, position_b])
-    way = usable_links["navigability"].cast(pl.String)
-    there = way.is_in([Navigability.AB.value, Navigability.BOTH.value]).to_numpy()
-    back = way.is_in([Navigability.BA.value, Navigability.BOTH.value]).to_numpy()
+    navigability = usable_links["navigability"].cast(pl.String)
+    there = navigability.is_in([Navigability.AB.value, Navigability.BOTH.value]).to_numpy()
+    back = navigability.is_in([Navigability.BA.value, Navigability.BOTH.value]).to_numpy()
     leaving = 2 * element_a + 1 - position_a
     entering = 2 * element_b + position_b
     # Piece by piece first, then each relation there and back, in their order.
     piece = np.flatnonzero(np.array([one == other for one, other in itertools.pairwise(track.ids)], dtype=np.bool_))
     joined = np.ones(2 * len(piece), dtype=np.bool_)
-    ways = _ways(
+    onward = _onward(
         2 * len(track.ids),
         np.concatenate([_in_turn(2 * piece, 2 * piece + 3), _in_turn(leaving, entering ^ 1)]),
         np.concatenate([_in_turn(2 * piece + 2, 2 * piece + 1), _in_turn(entering, leaving ^ 1)]),
@@ -229,11 +234,11 @@ def network_of(track: SurveyedTrack, links: pl.DataFrame) -> Network:
         np.concatenate([joined, _in_turn(there, back)]),
         np.concatenate([joined, _in_turn(back, there)]),
     )
-    return _oriented(track, ways)
+    return _oriented(track, onward)
 
 
 def _in_turn(first: np.ndarray, second: np.ndarray) -> np.ndarray:
-    """Of two columns the rows in turn."""
+    """Rows of two columns in turn."""
     return np.column_stack([first, second]).ravel()
 
 
@@ -248,8 +253,9 @@ def _linked_ends(track: SurveyedTrack, links: pl.DataFrame, side: str) -> tuple[
     return ints(element), ints(both["end"])
 
 
-def _ways(count: int, here: Ints, to: Ints, gap_m: Floats, forward: Bools, backward: Bools) -> Onward:
-    """Ways in the order given; relations given twice, or once from each side, are one way with what either allows."""
+def _onward(count: int, here: Ints, to: Ints, gap_m: Floats, forward: Bools, backward: Bools) -> Onward:
+    """Relations in the order given; one given twice, or once from each side, counts once, with what either allows."""
+    # `here * count + to` is one number for each pair of ends.
     _, begins, same = np.unique(here * count + to, return_index=True, return_inverse=True)
     allowed = np.zeros((2, len(begins)), dtype=np.bool_)
     np.logical_or.at(allowed[0], same, forward)
@@ -259,18 +265,18 @@ def _ways(count: int, here: Ints, to: Ints, gap_m: Floats, forward: Bools, backw
     return Onward(first, to[begins[order]], gap_m[begins[order]], allowed[0][order], allowed[1][order])
 
 
-def _oriented(track: SurveyedTrack, ways: Onward) -> Network:
-    """The network over these ways, with the orientations in use of each connected part."""
-    part = connected_parts(len(ways), ways.here, ways.to)
+def _oriented(track: SurveyedTrack, onward: Onward) -> Network:
+    """The network over these relations, with the orientations in use of each connected part."""
+    part = connected_parts(len(onward), onward.here, onward.to)
     turned = part.reshape(-1, 2)[:, ::-1].ravel()
     # Of a part and its mirror image the one that holds the first element in the sense of its measure.
     first = np.full(len(part), len(part))
     np.minimum.at(first, part[::2], np.arange(0, len(part), 2))
-    return Network(track, ways, part, first[part] <= first[turned], bool((part != turned).all()))
+    return Network(track, onward, part, first[part] <= first[turned], bool((part != turned).all()))
 
 
 def connected_parts(count: int, here: Ints, there: Ints) -> Ints:
-    """Per place the number of the part that it is connected with, which is that of its first place.
+    """Number of the part that each place is connected with, which is that of its first place.
 
     Written out: the library for graphs takes longer to load than a run to replay.
     """
@@ -279,7 +285,7 @@ def connected_parts(count: int, here: Ints, there: Ints) -> Ints:
         least = np.minimum(part[here], part[there])
         if (part[here] == least).all() and (part[there] == least).all():
             return part
-        # The first place of each part follows that of the part beside it, and then every place its first one.
+        # The first place of each part follows that of the neighbouring part, and then every place its first one.
         np.minimum.at(part, part[here], least)
         np.minimum.at(part, part[there], least)
         while (part[part] != part).any():
@@ -305,12 +311,12 @@ def network_along(track: SurveyedTrack, visits: list[Visit]) -> Network:
     split = track_in_parts(track, [(visit.element, part) for visit, part in parts])
     usable = np.array([visit.forward == (side == 0) for visit, _ in parts for side in (0, 1)])
     along = [Visit(number, visit.forward) for number, (visit, _) in enumerate(parts)]
-    ways = _onward_along_route(split, along)
-    return Network(split, ways, connected_parts(len(ways), ways.here, ways.to), usable, orientable=True)
+    onward = _onward_along_route(split, along)
+    return Network(split, onward, connected_parts(len(onward), onward.here, onward.to), usable, orientable=True)
 
 
 def _onward_along_route(track: SurveyedTrack, visits: Sequence[Visit]) -> Onward:
-    """Ways on from each oriented element by the relations that the route uses, and no other."""
+    """Successors by the relations that the route uses, and no other."""
     element = np.array([visit.element for visit in visits], dtype=np.int64)
     forward = np.array([visit.forward for visit in visits], dtype=np.int64)
     ends = end_places(track)
@@ -319,7 +325,7 @@ def _onward_along_route(track: SurveyedTrack, visits: Sequence[Visit]) -> Onward
     here = _in_turn(oriented[:-1], oriented[1:] ^ 1)
     there = _in_turn(oriented[1:], oriented[:-1] ^ 1)
     both = np.ones(len(here), dtype=np.bool_)
-    return _ways(2 * len(track.ids), here, there, np.repeat(gap_m, 2), both, both)
+    return _onward(2 * len(track.ids), here, there, np.repeat(gap_m, 2), both, both)
 
 
 @Once

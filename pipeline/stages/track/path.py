@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from pipeline.stages.track.network import Edge, Network
 
 
-# Only the order of the search: longer than any allowed way between two steps, so that an allowed one is found first.
+# Only the order of the search: longer than any allowed route between two steps, so that an allowed one is found first.
 BARRED_DETOUR_M = 10_000.0
 
 
@@ -48,6 +48,7 @@ class Chain:
 
     @property
     def high(self) -> int:
+        """Number of its last element."""
         return self.low + len(self.oriented) - 1
 
     @property
@@ -56,16 +57,17 @@ class Chain:
         return self.oriented[1:-1]
 
     def exit_m(self, network: Network) -> float:
+        """Coordinate at which the last element is left [m]."""
         return self.entry_m[-1] + network.length_m(self.oriented[-1])
 
     def after(self, network: Network, edge: Edge) -> Chain:
-        """The chain carried on over a way from its last element."""
+        """The chain carried on over a relation from its last element."""
         entry_m = self.exit_m(network) + edge.gap_m
         return Chain((*self.oriented, edge.to), (*self.entry_m, entry_m), self.low, self.shared)
 
     def before(self, network: Network, oriented: int) -> Chain:
         """The chain with an element before its first, that leads to it."""
-        entry_m = self.entry_m[0] - network.way(oriented, self.oriented[0]).gap_m - network.length_m(oriented)
+        entry_m = self.entry_m[0] - network.edge(oriented, self.oriented[0]).gap_m - network.length_m(oriented)
         return Chain((oriented, *self.oriented), (entry_m, *self.entry_m), self.low - 1, self.shared)
 
     def part(self, first: int, last: int, shared: int) -> Chain:
@@ -74,7 +76,7 @@ class Chain:
         return Chain(self.oriented[inside], self.entry_m[inside], first, shared)
 
     def turned(self, network: Network) -> Chain:
-        """The same elements run the other way round; coordinate and numbers change their signs."""
+        """The same elements run in the other direction; coordinate and numbers change their signs."""
         pairs = zip(self.oriented, self.entry_m, strict=True)
         entry_m = [-(entry_m + network.length_m(oriented)) for oriented, entry_m in pairs]
         around = tuple(oriented ^ 1 for oriented in reversed(self.oriented))
@@ -99,7 +101,7 @@ def moved_on(chains: list[Chain], network: Network, at: int, oriented: int, sens
     """The number of the element on the last chain that a train comes to from number `at`, ahead (+1) or behind (-1).
 
     The chain grows at its ends; where the train, having turned, takes another branch than that which it came from, a
-    new chain begins: the element that it is on and what lies behind it, then the other way on.
+    new chain begins: the element that it is on and what lies behind it, then the branch taken now.
     """
     chain = chains[-1]
     number = at + sense
@@ -110,7 +112,7 @@ def moved_on(chains: list[Chain], network: Network, at: int, oriented: int, sens
         chain = chain.part(chain.low, at, at) if sense > 0 else chain.part(at, chain.high, at)
         chains.append(chain)
     last = chain.oriented[-1]
-    chains[-1] = chain.after(network, network.way(last, oriented)) if sense > 0 else chain.before(network, oriented)
+    chains[-1] = chain.after(network, network.edge(last, oriented)) if sense > 0 else chain.before(network, oriented)
     return number
 
 
@@ -127,6 +129,7 @@ class Reach(NamedTuple):
         return self.chain.entry_m[-1]
 
     def after(self, network: Network, edge: Edge) -> Reach:
+        """Carried on over a relation."""
         barred = self.barred_forward + (not edge.forward), self.barred_backward + (not edge.backward)
         return Reach(self.chain.after(network, edge), *barred)
 
@@ -140,9 +143,9 @@ def search(
 ) -> Iterator[Reach]:
     """The chains that carry one on, itself the first, in order of the coordinate at which the last element is entered.
 
-    `until_m`: none is entered beyond; `onward`: the ways that a chain is carried on over; `same`: of chains that are
-    the same to the caller only the first counts. A move that is not allowed counts as a long detour, so that an allowed
-    way is preferred.
+    `until_m`: none is entered beyond; `onward`: the relations that a chain is carried on over; `same`: of chains that
+    are the same to the caller only the first counts. A move that is not allowed counts as a long detour, so that an
+    allowed route is preferred.
     """
     number = count()
     waiting = [(0.0, begin.oriented[-1], next(number), Reach(begin))]
@@ -222,12 +225,13 @@ class RoutePath:
 
     @cached_property
     def exit_m(self) -> Floats:
+        """Coordinate at which each element is left [m]."""
         return self.entry_m + self.high_m - self.low_m
 
     def coordinate(self, element: Ints, measure_m: Floats, near_m: Floats) -> tuple[Floats, Ints]:
         """Coordinate [m] of places, NaN where not on the route; +1 where it grows with the measure, else -1.
 
-        Of several visits the one nearest to `near_m` is meant: a lap more is no error of place.
+        Of several visits the one nearest to `near_m` is meant: one more circuit of a ring is no error of place.
         """
         coordinate_m = np.full(element.size, np.nan)
         sense = np.zeros(element.size, dtype=np.int64)
@@ -320,7 +324,7 @@ class TravelledPath:
         return np.array([*self.track.ids, None], dtype=object)[element], measure
 
     def locate_index(self, leg: Ints, path_m: Floats) -> tuple[Ints, Floats]:
-        """As `locate`, the net element as its number in the track (-1: not known)."""
+        """Net element and measure as `locate`, the element as its number in the track (-1: not known)."""
         element = np.full(len(path_m), -1, dtype=np.int64)
         measure = np.full(len(path_m), np.nan)
         for index, route_leg in enumerate(self.legs):

@@ -37,6 +37,7 @@ class Box:
         return np.flatnonzero(~outside)
 
     def holds(self, other: Box) -> bool:
+        """Whether another box lies within this one."""
         return bool((self.low_m <= other.low_m).all() and (self.high_m >= other.high_m).all())
 
 
@@ -83,12 +84,13 @@ class Polyline:
         """A search tree over points at most `SAMPLE_SPACING_M` apart, and the segment of each."""
         from scipy.spatial import cKDTree  # takes long to load, and a log needs none
 
-        way = self.end - self.start
-        pieces = np.maximum(1, np.ceil(np.linalg.norm(way, axis=1) / SAMPLE_SPACING_M)).astype(np.int64)
+        along = self.end - self.start
+        pieces = np.maximum(1, np.ceil(np.linalg.norm(along, axis=1) / SAMPLE_SPACING_M)).astype(np.int64)
+        # `number` counts the pieces of each segment from 0: the running number less that of its first piece.
         segment = np.repeat(np.arange(len(self)), pieces)
         number = np.arange(len(segment)) - np.repeat(np.cumsum(pieces) - pieces, pieces)
         fraction = ((number + 0.5) / pieces[segment])[:, None]
-        places = self.start.take(segment, axis=0) + fraction * way.take(segment, axis=0)
+        places = self.start.take(segment, axis=0) + fraction * along.take(segment, axis=0)
         # A tree without rebalancing builds faster and answers as fast on lines.
         return cKDTree(places, balanced_tree=False), segment
 
@@ -158,13 +160,14 @@ def downhill(points: Points, line: Polyline, segment: Ints, line_of: Ints | None
 
 
 def on_segments(points: Points, line: Polyline, segment: Ints) -> Feet:
-    """Each point on its given segment, in the tangent plane of the point; `fraction` is not limited."""
+    """Projection of each point on its segment, in the point's tangent plane; `fraction` is not limited."""
     to_start = line.start.take(segment, axis=0) - points.surface
     to_end = line.end.take(segment, axis=0) - points.surface
     x = _dot(to_start, points.east)
     y = _dot(to_start, points.north)
     dx = _dot(to_end, points.east) - x
     dy = _dot(to_end, points.north) - y
+    # Foot of the perpendicular from the origin (the point): t = -(s . d) / |d|^2; left offset = (s x d) / |d|.
     square = np.maximum(dx * dx + dy * dy, 1e-18)
     fraction = -(x * dx + y * dy) / square
     held = np.clip(fraction, 0.0, 1.0)
@@ -174,7 +177,7 @@ def on_segments(points: Points, line: Polyline, segment: Ints) -> Feet:
 
 
 def held_to_line(feet: Feet, count: int) -> Feet:
-    """At a corner between two segments the vertex is nearest; only beyond the ends the line goes on."""
+    """Feet held to the line: at a corner the vertex is nearest; only beyond the ends the line goes on."""
     low = np.where(feet.segment == 0, -np.inf, 0.0)
     high = np.where(feet.segment == count - 1, np.inf, 1.0)
     fraction = np.clip(feet.fraction, low, high)
@@ -185,6 +188,7 @@ def held_to_line(feet: Feet, count: int) -> Feet:
 
 
 def _dot(a: Floats, b: Floats) -> Floats:
+    """Scalar products row by row: shapes (n, 3), (n, 3) to (n,)."""
     return np.asarray(np.einsum("ij,ij->i", a, b))
 
 
@@ -235,10 +239,12 @@ class Leg:
 
     @property
     def start_m(self) -> float:
+        """Path position of its start [m]."""
         return float(self.path_start_m[0])
 
     @property
     def end_m(self) -> float:
+        """Path position of its end [m]."""
         return float(self.path_end_m[-1])
 
     def entry_m(self, number: int) -> float:
@@ -336,6 +342,7 @@ def _prefer_hint(point: Points, leg: Leg, hint_m: float, row: int, feet: Feet) -
 
 
 def _returns(line: Polyline, path_start_m: Floats) -> bool:
+    """Whether two points far apart along the line lie in the same place."""
     from scipy.spatial import cKDTree  # takes long to load, and a log needs none
 
     probes = np.unique(np.searchsorted(path_start_m, np.arange(path_start_m[0], path_start_m[-1], SAMPLE_SPACING_M)))
@@ -346,7 +353,7 @@ def _returns(line: Polyline, path_start_m: Floats) -> bool:
 
 
 def _gaps(surface: Floats, border: Bools) -> Floats:
-    """Way along the track that is missing between consecutive vertices [m]; zero but at borders of elements."""
+    """Length of track that is missing between consecutive vertices [m]; zero but at borders of elements."""
     gap = np.zeros(border.size)
     at = np.flatnonzero(border)
     along = _unit(surface[at] - surface[at - 1]) + _unit(surface[at + 2] - surface[at + 1])
@@ -356,11 +363,13 @@ def _gaps(surface: Floats, border: Bools) -> Floats:
 
 
 def _unit(vectors: Floats) -> Floats:
+    """Vectors of length 1, shape (n, 3); of no length where they had none."""
     length = np.linalg.norm(vectors, axis=1, keepdims=True)
     return np.asarray(np.divide(vectors, length, out=np.zeros_like(vectors), where=length > 0.0))
 
 
 def _vertices(track: SurveyedTrack, visit: Visit) -> Ints:
+    """Vertices of an element in the order in which the path runs over them."""
     part = np.arange(track.first[visit.element], track.first[visit.element + 1])
     return part if visit.forward else part[::-1]
 
@@ -373,8 +382,8 @@ def _without_scatter(surface: Floats, path_m: Floats, short_m: Floats) -> Floats
         return surface
     reach_m = np.minimum(BASELINE_M, np.minimum(path_m[rows] - path_m[0], path_m[-1] - path_m[rows]))
     before, after = (
-        np.column_stack([np.interp(path_m[rows] + way_m, path_m, axis) for axis in surface.T])
-        for way_m in (-reach_m, reach_m)
+        np.column_stack([np.interp(path_m[rows] + offset_m, path_m, axis) for axis in surface.T])
+        for offset_m in (-reach_m, reach_m)
     )
     moved = surface.copy()
     moved[rows] = 0.5 * (before + after)

@@ -1,8 +1,8 @@
 """The surveyed track as arrays: net elements with their vertices, measures and lengths; and in pieces.
 
 Elements that turn round come in pieces that do not. A balloon loop whose ends join the same switch, a ring, a ramp that
-crosses itself, a road up and down beside itself: the nearest place on the whole element may be the wrong one of two,
-that on a piece never is.
+crosses itself, a line that returns parallel to itself: the nearest place on the whole element may be the wrong one of
+two, that on a piece never is.
 """
 
 from __future__ import annotations
@@ -82,7 +82,7 @@ class SurveyedTrack:
         """The same elements with these measures [m]."""
         length_m = measure_m[self.first[1:] - 1] - measure_m[self.first[:-1]]
         again = replace(self, measure_m=measure_m, length_m=length_m)
-        # Places and ways do not depend on measures.
+        # Places and distances do not depend on measures.
         vars(again).update(surface=self.surface, geometric_m=self.geometric_m)
         return again
 
@@ -112,6 +112,7 @@ class SurveyedTrack:
         return ints(pairs["_balise"]), ints(pairs["_element"])
 
     def vertices(self, element: int) -> slice:
+        """The vertices of an element."""
         return slice(int(self.first[element]), int(self.first[element + 1]))
 
     def end(self, element: int, position: int) -> int:
@@ -127,6 +128,7 @@ class SurveyedTrack:
         return element if low_m - MEASURE_TOLERANCE_M <= measure_m <= high_m + MEASURE_TOLERANCE_M else None
 
     def elements(self) -> Iterator[tuple[int, str, slice]]:
+        """Number, name and vertices of each element."""
         for element, name in enumerate(self.ids):
             yield element, name, self.vertices(element)
 
@@ -213,7 +215,7 @@ def in_pieces(track: SurveyedTrack) -> SurveyedTrack:
 
 
 def pieces_of(track: SurveyedTrack) -> list[list[slice]]:
-    """Per element the vertices of its pieces in order; neighbours share one.
+    """Vertices of each element's pieces in order; neighbours share one.
 
     A piece ends where it has turned by more than a right angle since its start.
     """
@@ -226,11 +228,12 @@ def pieces_of(track: SurveyedTrack) -> list[list[slice]]:
 
 
 def _cuts(track: SurveyedTrack) -> list[list[int]]:
-    """Per element the vertices between its pieces."""
+    """Vertices between the pieces of each element, each of which turns by less than a right angle in all."""
     owner, vertex = _spaced_vertices(track)
     along = np.diff(track.surface[vertex], axis=0)
     same_element = owner[:-1] == owner[1:]
     start = np.searchsorted(owner, np.arange(len(track.ids)))
+    # Only elements that turn by a right angle against their first segment can need a cut.
     turned = same_element & (np.einsum("ij,ij->i", along, along[np.minimum(start[owner[:-1]], len(along) - 1)]) < 0.0)
     cuts: list[list[int]] = [[] for _ in track.ids]
     for element in np.unique(owner[:-1][turned]).tolist():

@@ -77,9 +77,20 @@ def calibrate(
     config: Configuration | None = None,
     solution: str = "primary",
 ) -> Calibration:
-    """`vehicle` brings lever arms and heights; its scale and latency, and noise and sigmas, are measured anew.
+    """Measure vehicle, fast noise and monitor sigmas on recorded runs.
 
-    Raises `InputError` where no run has the solution, or can be compared with an odometer.
+    Args:
+        logs: recorded fault-free runs.
+        site: their site.
+        vehicle: lever arms and heights [m]; its scale and latency are measured anew.
+        config: the configuration; None: the defaults.
+        solution: the solution to calibrate.
+
+    Returns:
+        Vehicle, monitor sigmas and fast noise, and what each run shows.
+
+    Raises:
+        InputError: no run has the solution, or can be compared with an odometer.
     """
     known = sorted({name for log in logs for name in log.solutions()})
     if solution not in known:
@@ -107,6 +118,7 @@ def observe(log: RunLog, site: Site, vehicle: Vehicle, config: Configuration, so
 
 
 def _estimate(match: Match, odometry: Odometry) -> RunEstimate | None:
+    """Scale and latency by the epochs with a position on the track."""
     rows = match.epochs.fix_valid & match.epochs.on_track
     return estimate_run(odometry.seconds(match.epochs.t_ns[rows]), match.epochs.path_m[rows], odometry)
 
@@ -125,7 +137,7 @@ def _monitored(
 
 
 def _alarms(log: RunLog, site: Site, vehicle: Vehicle, config: Configuration, solution: str) -> tuple[str, ...]:
-    """Of a replay without any noise given or measured: a fault must not pass for noise."""
+    """Alarms of a replay without any noise given or measured: a fault must not pass for noise."""
     replayed = replay(log, site, vehicle, _with_monitors(config, {**_AS_STATED, **_NO_NOISE}))
     return beyond_noise(replayed.epochs.filter(pl.col("solution") == solution), config.monitors.threshold_factor)
 
@@ -159,6 +171,7 @@ def calibration_of(runs: Sequence[Observed], vehicle: Vehicle, config: Configura
 
 
 def _loudest_noise_m(runs: Sequence[Observed]) -> dict[str, tuple[float, ...]]:
+    """Largest noise of all runs by key of `[monitors]` [m]."""
     names = sorted({name for run in runs for name in run.noise_m})
     shown = {name: [run.noise_m[name] for run in runs if name in run.noise_m] for name in names}
     return {name: tuple(np.max(noises_m, axis=0).tolist()) for name, noises_m in shown.items()}
@@ -175,6 +188,7 @@ def sigma_keys(sigmas: Sequence[SigmaFit], *, noisy: bool) -> dict[str, float]:
 
 
 def _with_monitors(config: Configuration, keys: Mapping[str, object]) -> Configuration:
+    """The configuration with some keys of `[monitors]` changed."""
     return config.model_copy(update={"monitors": config.monitors.model_copy(update=dict(keys))})
 
 
@@ -211,6 +225,7 @@ def _refuse_figures_of_no_train(vehicle: Vehicle, place: str, config: Configurat
 
 
 def _run_table(runs: Sequence[Observed]) -> pl.DataFrame:
+    """One row per run: scale and latency, null where they could not be estimated."""
     kinds: dict[str, type[pl.DataType]] = {field.name: pl.Float64 for field in fields(RunEstimate)}
     rows = [{"run_id": run.run_id} | ({} if run.estimate is None else asdict(run.estimate)) for run in runs]
     return pl.DataFrame(rows, schema={"run_id": pl.String} | kinds | {"points": pl.Int64})

@@ -36,7 +36,7 @@ COMPARED = (
 
 @frozen
 class SigmaFit:
-    """Position sigma = `intercept_m` + `slope` * stated sigma, as a monitor shows it; standard errors beside."""
+    """Position sigma = `intercept_m` + `slope` * stated sigma, as a monitor shows it; standard errors next to each."""
 
     monitor: str
     epochs: int
@@ -74,6 +74,7 @@ def _pieces(run: pl.DataFrame, monitor: str, axis: str, factor: float, count: in
 
 
 def _fit_with_errors(monitor: str, pieces: list[Floats], config: CalibrationConfig) -> SigmaFit:
+    """The fit of one monitor, with errors by leaving out each piece in turn (jackknife)."""
     count = len(pieces)
     whole = _fit(np.concatenate(pieces), config)
     errors = np.full(3, np.nan)
@@ -103,6 +104,7 @@ def _fit(samples: Floats, config: CalibrationConfig) -> Floats:
     measured = np.sqrt(np.bincount(place, squares, count.size)[filled] / count[filled])
     inverse = np.bincount(place, 1.0 / sigma, count.size)[filled] / count[filled]
     weight = np.sqrt(count[filled])
+    # ratio = b + a / sigma: linear in (a, b), both not negative; a bin of n samples has a weight of sqrt(n).
     design = np.column_stack([inverse, np.ones(inverse.size)])
     (intercept, slope), _ = nnls(design * weight[:, None], measured * weight)
     return np.array([overall, intercept, slope])
@@ -155,4 +157,5 @@ def beyond_noise(epochs: pl.DataFrame, factor: float) -> tuple[str, ...]:
 
 
 def _ratios(epochs: pl.DataFrame, monitor: str) -> pl.Series:
+    """Value over threshold where the monitor was evaluated."""
     return (epochs[f"{monitor}_value"] / epochs[f"{monitor}_threshold"]).drop_nulls()

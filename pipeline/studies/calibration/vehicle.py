@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from pipeline.stages.evidence.carrying import Counter
+from pipeline.stages.evidence.carrying import SignedOdometer
 from pipeline.stages.odometry import Odometry
 from pipeline.stages.odometry.scale_lag import scale_and_lag, spans_of_rows
 from schemas.arrays import Floats
@@ -17,7 +17,7 @@ from schemas.frozen import frozen
 
 @frozen
 class RunEstimate:
-    """One run's scale and latency [s], by so many ways of 10 s; no latency where it is not measured."""
+    """One run's scale and latency [s], by so many movements of 10 s; no latency where it is not measured."""
 
     scale: float
     scale_sigma: float
@@ -27,12 +27,18 @@ class RunEstimate:
 
 
 def estimate_run(t_s: Floats, path_m: Floats, odometry: Odometry) -> RunEstimate | None:
-    """From path positions [m] at usable epochs [s on the odometer's scale]; None where too little can be compared.
+    """Scale and latency of one run, by movements of 10 s.
 
-    `odometry` grows with the path.
+    Args:
+        t_s: times of usable epochs on the odometer's scale [s], shape (n,).
+        path_m: path positions [m], shape (n,).
+        odometry: the odometer, growing with the path.
+
+    Returns:
+        Scale and latency; None where too little can be compared.
     """
     begin, end = spans_of_rows(t_s)
-    found = scale_and_lag(t_s[begin], t_s[end], path_m[end] - path_m[begin], Counter(odometry).rows)
+    found = scale_and_lag(t_s[begin], t_s[end], path_m[end] - path_m[begin], SignedOdometer(odometry).rows)
     if not np.isfinite(found.scale_sigma):
         return None
     return RunEstimate(
@@ -53,7 +59,18 @@ class Pooled:
 
 
 def pooled(values: Floats, sigmas: Floats) -> Pooled:
-    """Runs together (DerSimonian and Laird 1986); the sigma includes their scatter: wheels wear and sensors drift."""
+    """Runs together; the sigma includes their scatter: wheels wear and sensors drift.
+
+    Args:
+        values: one figure per run, shape (n,).
+        sigmas: their standard deviations, shape (n,).
+
+    Returns:
+        The figure that the next run may have, with its standard deviation.
+
+    Source:
+        DerSimonian and Laird 1986.
+    """
     weight = 1.0 / sigmas**2
     mean = float(weight @ values / weight.sum())
     scatter = float(weight @ (values - mean) ** 2)

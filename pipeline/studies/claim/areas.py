@@ -31,10 +31,20 @@ class AreaPlaces:
 
 
 def read_areas(path: Path | str, site: Site) -> pl.DataFrame | None:
-    """`areas.parquet` or `areas.csv` of a site's folder; None where it has none.
+    """Read `areas.parquet` or `areas.csv` of a site's folder.
 
-    Not part of the site's digest: no replay reads it. Raises `SiteError` with every breach: unknown types and net
-    elements, areas that overlap or end before they begin.
+    Not part of the site's digest: no replay reads it.
+
+    Args:
+        path: the site's folder.
+        site: the site.
+
+    Returns:
+        `netelement_id`, `from_m`, `to_m`, `area_type` and `track_speed_kmh` of each area; None where the folder has no
+        such file.
+
+    Raises:
+        SiteError: unknown kinds and net elements, areas that overlap or end before they begin; all breaches at once.
     """
     present = [name for name in _NAMES if exists(join(path, name))]
     if not present:
@@ -53,6 +63,7 @@ def read_areas(path: Path | str, site: Site) -> pl.DataFrame | None:
 
 
 def _breaches(file: str, areas: pl.DataFrame, site: Site) -> list[str]:
+    """What is wrong with a file of areas: unknown net elements, overlaps."""
     known = set(site.track["netelement_id"])
     ordered = areas.sort("netelement_id", "from_m", maintain_order=True)
     breaches = [

@@ -47,7 +47,21 @@ def claim(
     areas: pl.DataFrame | None = None,
     ahead_m: float = 0.0,
 ) -> Claim:
-    """Hold all complete runs of a result against a profile; `ahead_m`: front end ahead of the balise antenna."""
+    """Hold all complete runs of a result against a profile of requirements.
+
+    Args:
+        out: the result of a campaign.
+        profile: the requirements.
+        site: the site of the result, where requirements ask for places.
+        areas: kinds of area along the site, as `read_areas` yields them.
+        ahead_m: front end ahead of the balise antenna [m].
+
+    Returns:
+        What was found of each requirement, and on what it rests.
+
+    Raises:
+        UsageError: the result is of another site.
+    """
     run_ids = store.complete_runs(out)
     config = store.read_config(out) or Configuration()
     for run_id, metadata in store.completed_runs(out).items():
@@ -87,6 +101,7 @@ def _tallies_of(
     areas: pl.DataFrame | None,
     ahead_m: float,
 ) -> Tallies:
+    """What one run counts for each requirement and area."""
     of_run = (store.read_table(out, name, run["run_id"]).collect() for name in ("epochs", "passages"))
     epochs, passages = (frame.filter(pl.col("solution") == run["solution"]) for frame in of_run)
     front = front_of(epochs, passages, run, config, profile.method, areas, ahead_m)
@@ -100,6 +115,7 @@ def _name(run: dict[str, Any]) -> str:
 
 
 def _add(sums: Tallies, more: Tallies) -> None:
+    """Add counts to the sums, in place."""
     for key, counts in more.items():
         sums[key] = sums.get(key, Tally()) + counts
 
@@ -115,6 +131,7 @@ def claim_table(by_solution: dict[str, Tallies], profile: RequirementProfile) ->
 
 
 def _row(solution: str, requirement: Requirement, counts: Tally) -> dict[str, Any]:
+    """One requirement of one solution, as a row of the result."""
     shown = requirement.demand.shown(counts)
     return {
         "solution": solution,
@@ -190,7 +207,14 @@ def _notes(
 
 
 def for_reading(claim: Claim) -> pl.DataFrame:
-    """The rows as they fit a screen: what was found of each requirement, and what it rests on."""
+    """The rows as they fit a screen: what was found of each requirement, and what it rests on.
+
+    Args:
+        claim: what was found.
+
+    Returns:
+        One row per requirement and solution.
+    """
     by_runs = {
         requirement.key
         for requirement in requirements(claim.profile)

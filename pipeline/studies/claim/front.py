@@ -1,8 +1,8 @@
 """Estimated and safe front end of a train at each epoch, and what the judge knows of their errors.
 
 A position in use gives the estimate, with its confidence. Where none is in use it is the report of ETCS: the last
-relevant balise and the odometer's way since then, with its over- and under-reading amounts. Uncertain latency widens
-both at speed. Else there is no estimate. Errors do not depend on where on the train the front end is.
+relevant balise and the odometer's distance since then, with its over- and under-reading amounts. Uncertain latency
+widens both at speed. Else there is no estimate. Errors do not depend on where on the train the front end is.
 
 Its speed is compared with the one that the evidence leaves, as means over windows.
 """
@@ -59,7 +59,7 @@ class Front:
         return np.isfinite(self.path_m)
 
     @property
-    def silent_s(self) -> Floats:
+    def without_data_s(self) -> Floats:
         """How long the log holds nothing after what each epoch holds [s]."""
         steps = np.diff(self.clock.t_ns, append=self.clock.t_ns[-1:]) / NS_PER_S
         return np.where(self.clock.held_s > 0, 0.0, steps)
@@ -85,7 +85,7 @@ def front_of(
     areas: pl.DataFrame | None = None,
     ahead_m: float = 0.0,
 ) -> Front:
-    """From the tables of one solution of one run; `ahead_m`: front end ahead of the balise antenna."""
+    """The front end from the tables of one solution of one run; `ahead_m`: its distance from the balise antenna."""
     path, direction, speed = (floats(epochs, name) for name in ("path_m", "direction", "speed_mps"))
     gnss = flags(epochs, "in_use") & np.isfinite(path)
     reported = _reported_m(epochs, passages)
@@ -98,11 +98,11 @@ def front_of(
     right, wrong, elsewhere = _judged(epochs, config.hazards.limits.failure_m)
     train_m = np.stack(train_path_m(epochs, stretches_of(epochs)))
     # Without a position nothing was judged: the report is compared with the place of the train itself.
-    silent = np.isnan(path) & np.isfinite(train_m).all(axis=0)
-    ends = np.where(silent, direction * (estimate - train_m), np.stack([low, high]))
-    low = np.where(silent, ends.min(axis=0), low)
-    high = np.where(silent, ends.max(axis=0), high)
-    right |= silent
+    unpositioned = np.isnan(path) & np.isfinite(train_m).all(axis=0)
+    ends = np.where(unpositioned, direction * (estimate - train_m), np.stack([low, high]))
+    low = np.where(unpositioned, ends.min(axis=0), low)
+    high = np.where(unpositioned, ends.max(axis=0), high)
+    right |= unpositioned
     there = np.isfinite(estimate)
     known = np.isfinite(low) & np.isfinite(high)
     # A train that has not moved yet has no direction of travel: its front end is looked up at the antenna.
@@ -139,7 +139,7 @@ def _judged(epochs: pl.DataFrame, limit_m: float) -> tuple[Bools, Bools, Bools]:
 
 
 def _latency_s(epochs: pl.DataFrame, run: dict[str, Any], config: Configuration) -> tuple[Floats, Floats]:
-    """By how much latency widens the interval behind and ahead of the estimate [s]; what is not known widens nothing.
+    """How much latency widens the interval behind and ahead of the estimate [s]; what is unknown widens nothing.
 
     A learned latency is not taken out of positions (DOMAIN 5.1), so the train may be ahead by it.
     """
@@ -150,7 +150,7 @@ def _latency_s(epochs: pl.DataFrame, run: dict[str, Any], config: Configuration)
 
 
 def _reported_m(epochs: pl.DataFrame, passages: pl.DataFrame) -> Floats:
-    """Path position by the last relevant balise and the odometer's way since then."""
+    """Path position by the last relevant balise and the odometer's distance since then."""
     accepted = passages.filter(pl.col("status").cast(pl.String) == PassageStatus.ACCEPTED.value).drop_nulls("path_m")
     odometer = floats(epochs, "odometer_m")
     distance = floats(epochs, "distance_from_lrvb_m")
@@ -206,7 +206,7 @@ def speed_errors(front: Front, window_s: float) -> SpeedErrors:
     until_m = np.concatenate(([0.0], np.cumsum(np.nan_to_num(steps_m))))
     estimated_m = front.direction[first] * (until_m[last] - until_m[first])
     least_m, most_m = _driven_m(front, first, last)
-    # The more the train drove, the lower the estimate lies beside it.
+    # The more the train drove, the lower the estimate lies relative to it.
     low_kmh = (estimated_m - most_m) / length_s * KMH_PER_MPS
     high_kmh = (estimated_m - least_m) / length_s * KMH_PER_MPS
     fastest = np.array([np.abs(front.speed_mps[begin : end + 1]).max() for begin, end in pairs], dtype=np.float64)
@@ -214,7 +214,7 @@ def speed_errors(front: Front, window_s: float) -> SpeedErrors:
 
 
 def _driven_m(front: Front, first: Ints, last: Ints) -> tuple[Floats, Floats]:
-    """Least and largest way of the train over windows by the evidence [m]; NaN unless it calls both ends right."""
+    """Least and largest distance of the train over windows by the evidence [m]; NaN unless it calls both ends right."""
     begin_m = _train_m(front, first)
     end_m = _train_m(front, last)
     # The estimate is a mean over the time before each epoch: how late that is while the speed changes is not known.
@@ -232,6 +232,7 @@ def _train_m(front: Front, rows: Ints) -> Floats:
 
 
 def _windows(front: Front, window_ns: int) -> list[tuple[int, int]]:
+    """First and last epoch of each window, over which the speed and one direction of travel are known."""
     held = front.clock.held_s
     t_ns = front.clock.t_ns
     sense = front.direction

@@ -155,7 +155,17 @@ def known_profiles() -> list[str]:
 
 
 def load_profile(name: str) -> RequirementProfile:
-    """A profile by its name, or from a file of its own. Raises `ConfigError` for one that is neither."""
+    """Load a profile of requirements.
+
+    Args:
+        name: name of a profile of the package, or path of a TOML file.
+
+    Returns:
+        The requirements.
+
+    Raises:
+        ConfigError: it is neither, or breaches the model.
+    """
     file = _FOLDER / f"{name}.toml" if name in known_profiles() else Path(name)
     if not file.is_file():
         known = known_profiles()

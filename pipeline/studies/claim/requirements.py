@@ -33,7 +33,7 @@ ALL = "all"
 
 @frozen
 class ClaimJourney:
-    """One solution of one run: its front end, and the tables that the requirements ask for beside it."""
+    """One solution of one run: its front end, and the tables that the requirements ask for besides."""
 
     name: str
     front: Front
@@ -42,16 +42,16 @@ class ClaimJourney:
     profile: RequirementProfile
 
     def tally(self, code: Ints, where: Bools, size: Floats | None = None) -> Tally:
-        """Of the epochs `where` a requirement applies, and of the gaps of the log that begin or end there."""
+        """Tally of the epochs `where` a requirement applies, and of the gaps of the log that begin or end there."""
         clock = self.front.clock
-        silent = self.front.silent_s
-        rows = np.flatnonzero(where | ((silent > 0) & np.append(where[1:], False)))
+        without_data_s = self.front.without_data_s
+        rows = np.flatnonzero(where | ((without_data_s > 0) & np.append(where[1:], False)))
         here = where[rows]
         held = np.where(here, clock.held_s[rows], 0.0)
         codes = np.where(here, code[rows], NOT_KNOWN)
         sizes = None if size is None else np.where(here, size[rows], np.nan)
         return count_claims(
-            self.name, clock.t_ns[rows], held, codes, self.profile.method.event_gap_s, sizes, silent[rows]
+            self.name, clock.t_ns[rows], held, codes, self.profile.method.event_gap_s, sizes, without_data_s[rows]
         )
 
     def inside(self, kind: AreaType) -> Bools:
@@ -85,6 +85,7 @@ class ClaimJourney:
 
     @cached_property
     def speeds(self) -> SpeedErrors:
+        """Errors of the speed, window by window."""
         return speed_errors(self.front, self.profile.method.speed_window_s)
 
     @cached_property
@@ -115,11 +116,12 @@ class Requirement:
 
     @property
     def key(self) -> Key:
+        """Name, and what it applies to."""
         return self.name, self.applies_to
 
 
 def tallies(journey: ClaimJourney) -> Tallies:
-    """Every requirement on one ride."""
+    """Every requirement on one journey."""
     return {requirement.key: requirement.count(journey) for requirement in requirements(journey.profile)}
 
 
@@ -145,10 +147,13 @@ def _safe(journey: ClaimJourney, kind: AreaType | None = None) -> Tally:
 
 
 def _asked(code: Ints, limit: Floats) -> Ints:
+    """The codes, not known where nothing is demanded (NaN)."""
     return np.where(np.isfinite(limit), code, NOT_KNOWN)
 
 
 def _of_area(kind: AreaType, area: AreaLimits, profile: RequirementProfile) -> list[Requirement]:
+    """What is demanded in areas of one type: MAPO and MAPU, safe front end, accuracy."""
+
     def exceeded(journey: ClaimJourney, name: str) -> Tally:
         code, size = journey.beyond[name]
         return journey.tally(code, journey.inside(kind), size)
@@ -206,7 +211,7 @@ def _after_balise(profile: RequirementProfile) -> list[Requirement]:
     after = profile.after_balise
 
     def count(journey: ClaimJourney, kind: BaliseKind) -> Tally:
-        """The balises of one kind on one ride, those passed faster than the requirement reaches left out."""
+        """The balises of one kind on one journey, those passed faster than the requirement reaches left out."""
         front = journey.front
         limit = after.limit_m(journey.front.speed_mps)
         # One more row: no epoch after the balise.
@@ -247,6 +252,7 @@ def _first_after(front: Front, at_ns: Ints) -> Ints:
 
 
 def _speed(profile: RequirementProfile) -> list[Requirement]:
+    """What is demanded of the speed: MASO and MASU, accuracy."""
     safe = profile.safe_speed
     speed = profile.speed
 
@@ -270,19 +276,19 @@ def _speed(profile: RequirementProfile) -> list[Requirement]:
 
 
 def _of_windows(journey: ClaimJourney, code: Ints, where: Bools) -> Tally:
-    """Of windows of speed, and of the gaps of the log between them, in order of time."""
+    """Tally of windows of speed, and of the gaps of the log between them, in order of time."""
     speeds = journey.speeds
-    gaps = np.flatnonzero(journey.front.silent_s > 0)
-    gap_s = journey.front.silent_s[gaps]
+    gaps = np.flatnonzero(journey.front.without_data_s > 0)
+    gap_s = journey.front.without_data_s[gaps]
     nothing = np.zeros(gaps.size)
     t_ns = np.concatenate((speeds.t_ns, journey.front.clock.t_ns[gaps]))
     held_s = np.concatenate((speeds.length_s, nothing))
-    silent_s = np.concatenate((np.zeros(speeds.t_ns.size), gap_s))
+    without_data_s = np.concatenate((np.zeros(speeds.t_ns.size), gap_s))
     codes = np.concatenate((code, np.full(gaps.size, NOT_KNOWN)))
     order = np.argsort(t_ns, kind="stable")
     rows = order[np.concatenate((where, gap_s > 0))[order]]
     gap = journey.profile.method.event_gap_s
-    return count_claims(journey.name, t_ns[rows], held_s[rows], codes[rows], gap, silent_s=silent_s[rows])
+    return count_claims(journey.name, t_ns[rows], held_s[rows], codes[rows], gap, without_data_s=without_data_s[rows])
 
 
 def _start(profile: RequirementProfile) -> list[Requirement]:
@@ -318,14 +324,16 @@ def _one(broken: bool) -> Tally:
 
 
 def _operation(profile: RequirementProfile) -> list[Requirement]:
-    """Availability, and ways without physical balises: none is ever proved."""
+    """Availability, and stretches without physical balises: none is ever proved."""
     asked = profile.availability
-    way_m = profile.way.without_balise_m
+    length_m = profile.way.without_balise_m
     outside = f"{asked.outside_s:g} s in {asked.within_s / S_PER_H:g} h"
     demand = Demand(Kind.AVAILABILITY, asked.share, outside_s=asked.outside_s)
     return [
         Requirement("availability", ALL, outside, demand, asked.clause, _availability),
-        Requirement("way_without_balise", ALL, f"{way_m / 1000:g} km", ALWAYS, profile.way.clause, _ways),
+        Requirement(
+            "way_without_balise", ALL, f"{length_m / 1000:g} km", ALWAYS, profile.way.clause, _without_physical_balises
+        ),
     ]
 
 
@@ -341,6 +349,7 @@ def _availability(journey: ClaimJourney) -> Tally:
     held = front.clock.held_s * (np.cumsum(front.output) > 0)
     t_s = (front.clock.t_ns - front.clock.t_ns[:1]) / NS_PER_S
     until = np.cumsum(np.where(lost, held, 0.0))
+    # Time lost up to the begin of the window that ends at each epoch.
     before = np.concatenate(([0.0], until))[np.searchsorted(t_s, t_s - asked.within_s)]
     worst_s = float((until - before).max(initial=0.0))
     return replace(
@@ -352,14 +361,16 @@ def _availability(journey: ClaimJourney) -> Tally:
     )
 
 
-def _ways(journey: ClaimJourney) -> Tally:
-    """Ways of at least the demanded length between physical balises; broken where MAPO or MAPU was exceeded on one."""
+def _without_physical_balises(journey: ClaimJourney) -> Tally:
+    """Stretches of at least the demanded length between physical balises; broken where MAPO or MAPU was exceeded on
+    one.
+    """
     odometer = journey.epochs["odometer_m"].cast(pl.Float64).to_numpy()
-    way = np.cumsum(np.abs(np.nan_to_num(np.diff(odometer, prepend=odometer[:1]))))
+    driven_m = np.cumsum(np.abs(np.nan_to_num(np.diff(odometer, prepend=odometer[:1]))))
     cuts = np.searchsorted(journey.front.clock.t_ns, _passed(journey.passages, BaliseKind.PHYSICAL))
-    bounds = np.unique(np.concatenate(([0], cuts, [way.size])))
+    bounds = np.unique(np.concatenate(([0], cuts, [driven_m.size])))
     broken = np.logical_or.reduce([code == BROKEN for code, _ in journey.beyond.values()])
-    lengths = [float(way[min(last, way.size - 1)] - way[first]) for first, last in pairwise(bounds)]
+    lengths = [float(driven_m[min(last, driven_m.size - 1)] - driven_m[first]) for first, last in pairwise(bounds)]
     long = [number for number, length in enumerate(lengths) if length >= journey.profile.way.without_balise_m]
     bad = sum(bool(broken[bounds[number] : bounds[number + 1]].any()) for number in long)
     return Tally(trials=len(long), broken=bad, events=bad, possible=len(long), worst=max(lengths, default=None))

@@ -66,20 +66,20 @@ def count_claims(
     code: Ints,
     gap_s: float,
     size: Floats | None = None,
-    silent_s: Floats | float = 0.0,
+    without_data_s: Floats | float = 0.0,
 ) -> Tally:
-    """Of the epochs of one run to which a requirement applies, in order of time; `run` draws its trial.
+    """Count the epochs of one run to which a requirement applies, in order of time; `run` draws its trial.
 
-    `silent_s`: how long the log holds nothing after each epoch's own time `held_s`; nobody knows what was then.
+    `without_data_s`: how long the log holds nothing after each epoch's own time `held_s`; nobody knows what was then.
     """
     if code.size == 0:
         return Tally()
-    silent = np.broadcast_to(silent_s, code.shape)
-    trial = _trial(run, held_s, silent, code)
+    without_data = np.broadcast_to(without_data_s, code.shape)
+    trial = _trial(run, held_s, without_data, code)
     known = code != NOT_KNOWN
     sizes = size[known & np.isfinite(size)] if size is not None else np.empty(0)
-    doubtful = (code != KEPT) | (silent > 0)
-    until_ns = t_ns + np.where(silent > 0, (held_s + silent) * NS_PER_S, 0).astype(np.int64)
+    doubtful = (code != KEPT) | (without_data > 0)
+    until_ns = t_ns + np.where(without_data > 0, (held_s + without_data) * NS_PER_S, 0).astype(np.int64)
     return Tally(
         trials=1,
         kept=int(trial == KEPT),
@@ -103,10 +103,10 @@ def clusters_s(from_ns: Ints, to_ns: Ints, gap_s: float) -> list[float]:
     return lengths
 
 
-def _trial(run: str, held_s: Floats, silent_s: Floats, code: Ints) -> int:
+def _trial(run: str, held_s: Floats, without_data_s: Floats, code: Ints) -> int:
     """The code of one instant by chance; of one epoch where none of them holds for any time."""
-    # What an epoch holds, then what is silent after it, one after the other.
-    lengths = np.column_stack([held_s, silent_s]).ravel()
+    # What an epoch holds, then what has no data after it, one after the other.
+    lengths = np.column_stack([held_s, without_data_s]).ravel()
     codes_of = np.column_stack([code, np.full(code.size, NOT_KNOWN)]).ravel()
     if not lengths.any():
         lengths = np.ones(code.size)
@@ -144,6 +144,7 @@ class Demand:
 
     @property
     def words(self) -> str:
+        """The demand as a formula."""
         if self.kind is Kind.ALWAYS:
             return "always"
         return f"< {self.limit:g} /h" if self.kind is Kind.RATE else f"p >= {self.limit:g}"
@@ -171,8 +172,8 @@ class Demand:
         if broken.finding is Compliance.MET:
             return Shown(Compliance.NOT_SHOWN, kept) if self.by_means else Shown(Compliance.MET, kept, 0.0)
         hours = tally.held_s / tally.trials / S_PER_H
-        untold = self.by_means or broken.needed is None or hours <= 0.0
-        return Shown(broken.finding, kept, None if untold else hours * (broken.needed or 0))
+        unknown = self.by_means or broken.needed is None or hours <= 0.0
+        return Shown(broken.finding, kept, None if unknown else hours * (broken.needed or 0))
 
     def _available(self, tally: Tally) -> Shown:
         """Broken runs were unavailable for `outside_s` at least, so for that part of the longest run at least.

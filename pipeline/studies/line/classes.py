@@ -85,7 +85,7 @@ def _count_per_piece(passes: pl.DataFrame, criteria: LineCriteria) -> pl.DataFra
             lost=lost.sum(),
             wrong_in_use=wrong.sum(),
             claimed_wrongly=pl.col("claimed").sum(),
-            unknown=state.is_between(int(SpanState.UNSEEN), int(SpanState.UNKNOWN)).sum(),
+            unknown=state.is_between(int(SpanState.NOT_COVERED), int(SpanState.UNKNOWN)).sum(),
             unjudged=(state == int(SpanState.UNKNOWN)).sum(),
             after_alarm=(state == int(SpanState.AFTER_ALARM)).sum(),
             wrong_track=(cause == LineCause.WRONG_TRACK.value).sum(),
@@ -101,29 +101,30 @@ def _count_per_piece(passes: pl.DataFrame, criteria: LineCriteria) -> pl.DataFra
 
 
 def _by_frequency(names: pl.Series) -> str:
+    """Names once each, the most frequent first."""
     return " ".join(name for name, _ in sorted(Counter(names).items(), key=lambda item: (-item[1], item[0])))
 
 
 def _judged(counted: pl.DataFrame, criteria: LineCriteria) -> pl.DataFrame:
-    """With bounds, class and cause: what was not judged counts against each bound."""
+    """Pieces with bounds, class and cause: what was not judged counts against each bound."""
     cases = counted.select(_TRIALS).unique()
     rows = [_shown(bad, number, wrong, unjudged, criteria) for bad, number, wrong, unjudged in cases.iter_rows()]
     shown = pl.DataFrame(rows, schema=_SHOWN, orient="row")
     judged = counted.join(pl.concat([cases, shown], how="horizontal"), on=_TRIALS, how="left", maintain_order="left")
     misleading = (pl.col("wrong_in_use") > 0) | (pl.col("claimed_wrongly") > 0)
     unsuitable = misleading | (pl.col("finding") == Compliance.NOT_MET.value)
-    met = pl.col("finding") == Compliance.MET.value
+    is_met = pl.col("finding") == Compliance.MET.value
     hours = pl.col("hours") >= criteria.hours_least
     piece_class = (
         pl.when(unsuitable)
         .then(pl.lit(PieceClass.UNSUITABLE.value))
-        .when(met & hours)
+        .when(is_met & hours)
         .then(pl.lit(PieceClass.SUITABLE.value))
         .otherwise(pl.lit(PieceClass.UNKNOWN.value))
     )
     return judged.with_columns(
         piece_class=piece_class,
-        cause=_cause(unsuitable, met, hours),
+        cause=_cause(unsuitable, is_met, hours),
         passes_needed=pl.when(~unsuitable).then("passes_needed"),
     )
 

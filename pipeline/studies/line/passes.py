@@ -17,7 +17,7 @@ from schemas.line import LineCause, LineCriteria
 from schemas.run import Site
 
 CAUSES = {
-    SpanState.UNSEEN: LineCause.NOT_JUDGED,
+    SpanState.NOT_COVERED: LineCause.NOT_JUDGED,
     SpanState.UNKNOWN: LineCause.NOT_JUDGED,
     SpanState.AFTER_ALARM: LineCause.AFTER_ALARM,
     SpanState.ALARM: LineCause.ALARM,
@@ -42,7 +42,7 @@ _PASSES = _OUTCOMES | {"monitor": pl.String, "satellites": pl.Float64}
 
 @frozen
 class PieceIndex:
-    """The pieces with their middles in the plane, to find those beside a place."""
+    """The pieces with their middles in the plane, to find those near a place."""
 
     site: Site
     pieces: Pieces
@@ -50,9 +50,10 @@ class PieceIndex:
 
     @classmethod
     def of(cls, site: Site, pieces: Pieces, middles_m: Floats) -> PieceIndex:
+        """The index over pieces with these middles [m]."""
         return cls(site, pieces, cKDTree(np.nan_to_num(middles_m, nan=1e12)))
 
-    def beside(self, rows: pl.DataFrame, reach_m: float) -> Ints:
+    def near(self, rows: pl.DataFrame, reach_m: float) -> Ints:
         """Pieces within reach of the places of some epochs."""
         place = plane_of(self.site, ground_of(self.site.track, rows["netelement_id"], floats(rows, "measure_m")))
         place = place[np.isfinite(place).all(axis=1)]
@@ -78,23 +79,24 @@ def passes_of(
     epochs = epochs.sort("t")
     if epochs.height < 2:
         return pl.DataFrame(schema=_PASSES)
-    legs = stretches_of(epochs)
+    stretches = stretches_of(epochs)
     states = states_of(epochs, alarms["t_start"], config)
-    spans = spans_of(epochs, states, legs, config)
-    hits = laid_on(spans, legs, ground.pieces)
-    parts = [_worst(hits, ground.pieces, criteria), _unsafe(passages, epochs, legs, ground.pieces)]
-    parts += _misleading(epochs, states, legs, ground, criteria)
+    spans = spans_of(epochs, states, stretches, config)
+    hits = laid_on(spans, stretches, ground.pieces)
+    parts = [_worst(hits, ground.pieces, criteria), _unsafe(passages, epochs, stretches, ground.pieces)]
+    parts += _misleading(epochs, states, stretches, ground, criteria)
     return _explained(_merged(pl.concat(parts)), hits, alarms)
 
 
-def laid_on(spans: pl.DataFrame, legs: pl.DataFrame, pieces: Pieces) -> pl.DataFrame:
-    """The spans' columns per piece and direction that they touch, with `begin_m, end_m`: the likely way on the piece.
+def laid_on(spans: pl.DataFrame, stretches: pl.DataFrame, pieces: Pieces) -> pl.DataFrame:
+    """The spans' columns per piece and direction that they touch, with `begin_m, end_m`: the likely stretch on the
+    piece.
 
-    A span counts on the net elements of the train only, not on a track that runs beside them on the path. An outage,
+    A span counts on the net elements of the train only, not on a track that runs next to them on the path. An outage,
     and what is unknown, count on all of them: nobody saw which of them it led over.
     """
     laid: list[pl.DataFrame] = []
-    for name, sign, offset_m in legs.select("netelement_id", "sign", "offset_m").iter_rows():
+    for name, sign, offset_m in stretches.select("netelement_id", "sign", "offset_m").iter_rows():
         element = pieces.track.index.get(name)
         if element is None:
             continue
@@ -107,6 +109,7 @@ def laid_on(spans: pl.DataFrame, legs: pl.DataFrame, pieces: Pieces) -> pl.DataF
         begin = pieces.at(element, floats(kept, "low"))
         end = pieces.at(element, floats(kept, "high"))
         index = np.repeat(np.arange(kept.height), end - begin + 1)
+        # Number of each piece within its span.
         ahead = np.arange(len(index)) - np.repeat(np.cumsum(end - begin + 1) - (end - begin + 1), end - begin + 1)
         piece = begin[index] + ahead
         hit = kept[index].with_columns(piece=pl.Series(piece, dtype=pl.Int64))
@@ -126,15 +129,15 @@ def _measures(spans: pl.DataFrame, sign: int, offset_m: float) -> pl.DataFrame:
 
 
 def _worst(hits: pl.DataFrame, pieces: Pieces, criteria: LineCriteria) -> pl.DataFrame:
-    """One row per piece and direction; a right one that saw too little of the piece is not seen."""
+    """One row per piece and direction; a right one that covered too little of the piece is not counted."""
     worst = hits.group_by("piece", "growing").agg(
         state=pl.col("state").max(),
-        seen_m=pl.col("end_m").max() - pl.col("begin_m").min(),
+        covered_m=pl.col("end_m").max() - pl.col("begin_m").min(),
         t=pl.col("t").min(),
     )
     length_m = (pieces.to_m - pieces.from_m)[worst["piece"].to_numpy()]
-    short = (pl.col("state") == int(SpanState.RIGHT)) & (pl.col("seen_m") < criteria.coverage * pl.Series(length_m))
-    state = pl.when(short).then(int(SpanState.UNSEEN)).otherwise(pl.col("state"))
+    short = (pl.col("state") == int(SpanState.RIGHT)) & (pl.col("covered_m") < criteria.coverage * pl.Series(length_m))
+    state = pl.when(short).then(int(SpanState.NOT_COVERED)).otherwise(pl.col("state"))
     return _rows(worst.with_columns(state=state))
 
 
@@ -149,7 +152,7 @@ def _rows(frame: pl.DataFrame, cause: LineCause | None = None) -> pl.DataFrame:
     )
 
 
-def _unsafe(passages: pl.DataFrame, epochs: pl.DataFrame, legs: pl.DataFrame, pieces: Pieces) -> pl.DataFrame:
+def _unsafe(passages: pl.DataFrame, epochs: pl.DataFrame, stretches: pl.DataFrame, pieces: Pieces) -> pl.DataFrame:
     """Pieces of virtual balises that were accepted at a wrong place, in the direction in which the train went."""
     unsafe = passages.filter(
         (pl.col("status") == PassageStatus.ACCEPTED.value)
@@ -157,45 +160,45 @@ def _unsafe(passages: pl.DataFrame, epochs: pl.DataFrame, legs: pl.DataFrame, pi
         & (pl.col("kind") == BaliseKind.VIRTUAL.value)
     ).with_columns(t=pl.coalesce("t_offered", "t_true"))
     there = unsafe.sort("t").join_asof(epochs.select("t", ahead="direction"), on="t")
-    return _rows(_named(there, legs, pieces), LineCause.UNSAFE_ACCEPTANCE)
+    return _rows(_named(there, stretches, pieces), LineCause.UNSAFE_ACCEPTANCE)
 
 
 def _misleading(
-    epochs: pl.DataFrame, states: Ints, legs: pl.DataFrame, ground: PieceIndex, criteria: LineCriteria
+    epochs: pl.DataFrame, states: Ints, stretches: pl.DataFrame, ground: PieceIndex, criteria: LineCriteria
 ) -> list[pl.DataFrame]:
-    """Pieces that wrong positions in use claimed, and those beside a position on a wrong track."""
+    """Pieces that wrong positions in use claimed, and those near a position on a wrong track."""
     placed = epochs.with_columns(state=pl.Series(states), ahead="direction").filter(
         pl.col("netelement_id").is_not_null()
     )
     track = pl.col("error_low_m").is_null()
     in_use = pl.col("state") == int(SpanState.WRONG_IN_USE)
-    claims = _named(placed.filter(in_use & ~track), legs, ground.pieces)
+    claims = _named(placed.filter(in_use & ~track), stretches, ground.pieces)
     parts = [_rows(claims, LineCause.CLAIMED_WRONGLY)]
     for state in (SpanState.WRONG_TRACK, SpanState.WRONG_IN_USE):
         rows = placed.filter(track & (pl.col("state") == int(state)))
         if rows.height:
-            # On which of these tracks it was, and so which way over each, nobody knows.
-            piece = pl.DataFrame({"piece": ground.beside(rows, criteria.beside_m)})
+            # On which of these tracks it was, and so in which direction over each, nobody knows.
+            piece = pl.DataFrame({"piece": ground.near(rows, criteria.beside_m)})
             both = piece.join(pl.DataFrame({"growing": [True, False]}), how="cross")
             lone = both.with_columns(state=pl.lit(int(state)), t=pl.lit(rows["t"][0]))
             parts.append(_rows(lone, LineCause.WRONG_TRACK))
     return parts
 
 
-def _named(rows: pl.DataFrame, legs: pl.DataFrame, pieces: Pieces) -> pl.DataFrame:
+def _named(rows: pl.DataFrame, stretches: pl.DataFrame, pieces: Pieces) -> pl.DataFrame:
     """`piece, growing, state, t` of the places that rows name; `ahead`: their direction on growing path.
 
     Both directions where that is not known.
     """
     signs: dict[str, set[int]] = {}
-    for name, sign in legs.select("netelement_id", "sign").iter_rows():
+    for name, sign in stretches.select("netelement_id", "sign").iter_rows():
         signs.setdefault(name, set()).add(sign)
     first_times: dict[tuple[int, bool], object] = {}
     for name, at, ahead, t in rows.select("netelement_id", "measure_m", "ahead", "t").iter_rows():
         if (piece := pieces.holding(name, at)) is None:
             continue
-        ways = {sign * ahead > 0 for sign in signs.get(name, ())} if ahead in (1, -1) else set()
-        for growing in ways or {True, False}:
+        senses = {sign * ahead > 0 for sign in signs.get(name, ())} if ahead in (1, -1) else set()
+        for growing in senses or {True, False}:
             first_times.setdefault((piece, growing), t)
     schema = {name: _OUTCOMES[name] for name in ("piece", "growing", "state", "t")}
     table = [(piece, growing, int(SpanState.WRONG_IN_USE), t) for (piece, growing), t in first_times.items()]
@@ -203,7 +206,7 @@ def _named(rows: pl.DataFrame, legs: pl.DataFrame, pieces: Pieces) -> pl.DataFra
 
 
 def _merged(rows: pl.DataFrame) -> pl.DataFrame:
-    """One row per piece and direction: the worst state with its cause; a mere claim stands beside that."""
+    """One row per piece and direction: the worst state with its cause; a mere claim stands next to that."""
     claims = rows.filter("claimed").select("piece", "growing").unique().with_columns(has_claim=pl.lit(value=True))
     unclaimed = rows.filter(~pl.col("claimed"))
     worst = (
@@ -214,11 +217,11 @@ def _merged(rows: pl.DataFrame) -> pl.DataFrame:
     both = worst.join(claims, on=["piece", "growing"], how="left")
     lone = rows.filter("claimed").join(unclaimed, on=["piece", "growing"], how="anti").unique(["piece", "growing"])
     kept = both.with_columns(claimed=pl.col("has_claim").fill_null(value=False)).drop("has_claim")
-    return pl.concat([kept, lone.with_columns(state=pl.lit(int(SpanState.UNSEEN)).cast(pl.Int64))])
+    return pl.concat([kept, lone.with_columns(state=pl.lit(int(SpanState.NOT_COVERED)).cast(pl.Int64))])
 
 
 def _explained(passes: pl.DataFrame, hits: pl.DataFrame, alarms: pl.DataFrame) -> pl.DataFrame:
-    """With the monitor that failed first in an alarm that began on the piece, and the satellites at the worst place."""
+    """Passes with the monitor that failed first in an alarm on the piece, and the satellites at the worst place."""
     keys = ["piece", "growing"]
     worst = hits.filter(pl.col("state") == pl.col("state").max().over(keys)).group_by(keys).agg(pl.min("satellites"))
     first = alarms.select(t="t_start", monitor=pl.col("monitors").list.first()).unique("t")

@@ -37,16 +37,18 @@ class Pieces:
 
     @property
     def middle_m(self) -> Floats:
+        """Measure of the middle of each piece [m]."""
         middle: Floats = 0.5 * (self.from_m + self.to_m)
         return middle
 
     @property
     def names(self) -> list[str]:
+        """Net element of each piece."""
         return [self.track.ids[number] for number in self.element]
 
 
 def pieces_of(site: Site, piece_m: float) -> Pieces:
-    """Each element in equal pieces as near to `piece_m` as can be."""
+    """Elements cut into equal pieces, as near to `piece_m` as can be."""
     track = track_of(site.track)
     counts = np.maximum(1, np.rint(track.length_m / piece_m)).astype(np.int64)
     element = np.repeat(np.arange(len(counts)), counts)

@@ -22,13 +22,13 @@ from schemas.frozen import frozen
 from schemas.line import LineBalises, LineCriteria, LineDirection, LineProposals, PieceClass
 from schemas.run import Site
 
-# Directions of travel, ahead along the ways that the elements form or against it.
+# Directions of travel, ahead along the chains that the elements form or against it.
 MODES = {"both": (True, False), "ahead": (True,), "back": (False,)}
 
 
 @frozen
 class LineEvidence:
-    """What a proposal is made of: classes and counts per piece, the ways, the points to serve."""
+    """What a proposal is made of: classes and counts per piece, the chains, the points to serve."""
 
     site: Site
     pieces: Pieces
@@ -39,8 +39,8 @@ class LineEvidence:
     lds: LdsConfig
 
 
-_WAY = {"piece": pl.Int64, "at_m": pl.Float64, "growing": pl.Boolean}
-"""A way: pieces in the order of a train, their middles from its begin; `growing`: with their measure."""
+_CHAIN_COLUMNS = {"piece": pl.Int64, "at_m": pl.Float64, "growing": pl.Boolean}
+"""A chain: pieces in the order of a train, their middles from its begin; `growing`: with their measure."""
 _PLACED: dict[str, pl.DataType | type[pl.DataType]] = {
     "piece": pl.Int64,
     "growing": pl.Boolean,
@@ -48,17 +48,17 @@ _PLACED: dict[str, pl.DataType | type[pl.DataType]] = {
     "distance_m": pl.Float64,
     "since": pl.List(pl.Int64),
 }
-"""A balise on a piece of a way; `distance_m` from the one before, over the pieces `since` that one."""
+"""A balise on a piece of a chain; `distance_m` from the one before, over the pieces `since` that one."""
 
 
 def proposals(line: LineEvidence) -> tuple[pl.DataFrame, pl.DataFrame]:
     """`LineProposals` and `LineBalises`; none where no piece is suitable."""
     rows = []
     balises = [pl.DataFrame(schema=dtypes(LineBalises))]
-    ways = _ways(line)
+    chains = _chains(line)
     growing = np.ones(len(line.pieces.element), dtype=np.bool_)
-    for way in ways:
-        growing[way["piece"].to_numpy()] = way["growing"].to_numpy()
+    for chain in chains:
+        growing[chain["piece"].to_numpy()] = chain["growing"].to_numpy()
     near = _near(line)
     for mode, sides in MODES.items():
         allowed = _allowed(line, sides, growing)
@@ -66,7 +66,9 @@ def proposals(line: LineEvidence) -> tuple[pl.DataFrame, pl.DataFrame]:
             continue
         for spacing_m in line.criteria.spacings_m:
             name = f"{mode}-{spacing_m:g}m"
-            walked = [row for way in ways for row in _walk(way, allowed, near["near_m"], spacing_m, line.criteria)]
+            walked = [
+                row for chain in chains for row in _walk(chain, allowed, near["near_m"], spacing_m, line.criteria)
+            ]
             placed = _disjoint(line, _placed(line, walked, sides, near["near"]))
             balises.append(_balises(line, name, placed))
             rows.append(_figures(line, name, spacing_m, mode, placed, growing))
@@ -75,7 +77,15 @@ def proposals(line: LineEvidence) -> tuple[pl.DataFrame, pl.DataFrame]:
 
 
 def site_balises(balises: pl.DataFrame, criteria: LineCriteria) -> pl.DataFrame:
-    """A proposal as the `balises` table of a site."""
+    """A proposal as the `balises` table of a site.
+
+    Args:
+        balises: a proposal.
+        criteria: location accuracy of its balises [m].
+
+    Returns:
+        Rows of `balises.parquet` (CONTRACT section 2).
+    """
     return balises.select(
         "balise_id",
         "netelement_id",
@@ -89,7 +99,7 @@ def site_balises(balises: pl.DataFrame, criteria: LineCriteria) -> pl.DataFrame:
 
 
 def _allowed(line: LineEvidence, sides: Sequence[bool], growing: Bools) -> Bools:
-    """Pieces suitable in every one of these directions along their ways."""
+    """Pieces suitable in every one of these directions along their chains."""
     suitable = (line.table["piece_class"].cast(pl.String) == PieceClass.SUITABLE.value).to_numpy()
     rising = suitable[0::2]
     falling = suitable[1::2]
@@ -98,18 +108,21 @@ def _allowed(line: LineEvidence, sides: Sequence[bool], growing: Bools) -> Bools
     return allowed
 
 
-def _ways(line: LineEvidence) -> list[pl.DataFrame]:
-    """The pieces of the travelled net elements in chains that trains can run (`_WAY`), each element once."""
+def _chains(line: LineEvidence) -> list[pl.DataFrame]:
+    """The pieces of the travelled net elements in chains that trains can run (`_CHAIN_COLUMNS`), each element once."""
     network = network_of(line.pieces.track, line.site.links)
     passed = line.passes.filter(pl.col("state") != int(SpanState.WRONG_TRACK))["piece"].unique()
     wanted = {int(element) for element in np.unique(line.pieces.element[passed.to_numpy()])}
-    ways = []
+    chains = []
     while wanted:
         start = min(
-            (2 * piece + side for piece in wanted for side in (0, 1)), key=lambda way: _rank(network, way, wanted)
+            (2 * piece + side for piece in wanted for side in (0, 1)),
+            key=lambda oriented: _rank(network, oriented, wanted),
         )
-        ways.append(pl.DataFrame(list(_chain(network, line.pieces, start, wanted)), schema=_WAY, orient="row"))
-    return ways
+        chains.append(
+            pl.DataFrame(list(_chain(network, line.pieces, start, wanted)), schema=_CHAIN_COLUMNS, orient="row")
+        )
+    return chains
 
 
 def _rank(network: Network, oriented: int, wanted: set[int]) -> tuple[int, int]:
@@ -119,6 +132,7 @@ def _rank(network: Network, oriented: int, wanted: set[int]) -> tuple[int, int]:
 
 
 def _chain(network: Network, pieces: Pieces, start: int, wanted: set[int]) -> Iterator[tuple[int, float, bool]]:
+    """Rows of `_CHAIN_COLUMNS` from an oriented element on, over wanted elements only; takes these out of `wanted`."""
     oriented: int | None = start
     entry_m = 0.0
     while oriented is not None:
@@ -150,13 +164,13 @@ def _near(line: LineEvidence) -> pl.DataFrame:
 
 
 def _walk(
-    way: pl.DataFrame, allowed: Bools, near_m: pl.Series, spacing_m: float, criteria: LineCriteria
+    chain: pl.DataFrame, allowed: Bools, near_m: pl.Series, spacing_m: float, criteria: LineCriteria
 ) -> Iterator[tuple[object, ...]]:
     """Rows of `_PLACED`: at each step the best piece about a spacing on; where none is allowed a physical one.
 
     Best is near a station or signal, then at the spacing itself.
     """
-    piece, at_m, growing = (way[name].to_numpy() for name in _WAY)
+    piece, at_m, growing = (chain[name].to_numpy() for name in _CHAIN_COLUMNS)
     away_m = near_m.to_numpy()[piece]
     spacing_m = min(spacing_m, criteria.longest_m)
     play_m = criteria.spacing_play * spacing_m
@@ -181,13 +195,13 @@ def _placed(
     """`_PLACED` with place, kind, the direction in which a virtual one serves its travel, and what it is near."""
     placed = pl.DataFrame(walked, schema=_PLACED, orient="row")
     piece = placed["piece"].to_numpy()
-    one_way = pl.col("virtual") & (len(sides) == 1)
+    one_direction = pl.col("virtual") & (len(sides) == 1)
     along = pl.when(pl.col("growing") == sides[0]).then(pl.lit(BaliseDirection.AB.value))
     return placed.with_columns(
         netelement_id=pl.Series([line.pieces.names[number] for number in piece], dtype=pl.String),
         measure_m=np.round(line.pieces.middle_m[piece], 3),
         kind=pl.when("virtual").then(pl.lit(BaliseKind.VIRTUAL.value)).otherwise(pl.lit(BaliseKind.PHYSICAL.value)),
-        direction=pl.when(one_way)
+        direction=pl.when(one_direction)
         .then(along.otherwise(pl.lit(BaliseDirection.BA.value)))
         .otherwise(pl.lit(BaliseDirection.BOTH.value)),
         near=near.gather(piece),
@@ -195,7 +209,7 @@ def _placed(
 
 
 def _disjoint(line: LineEvidence, placed: pl.DataFrame) -> pl.DataFrame:
-    """Without balises whose windows linking cannot tell apart, as where ways meet; the later one goes."""
+    """Without balises whose windows linking cannot tell apart, as where chains meet; the later one goes."""
     while True:
         # Announced in one list, whatever their kind.
         balises = placed.select(
@@ -232,6 +246,7 @@ def _balises(line: LineEvidence, name: str, placed: pl.DataFrame) -> pl.DataFram
 def _figures(
     line: LineEvidence, name: str, spacing_m: float, mode: str, placed: pl.DataFrame, growing: Bools
 ) -> dict[str, object]:
+    """The figures of one proposal, as a row of the result."""
     virtual = placed.filter("virtual")
     sides = [(piece, bool(growing[piece]) == ahead, ahead) for piece in virtual["piece"] for ahead in MODES[mode]]
     schema = {"piece": pl.Int64, "growing": pl.Boolean, "ahead": pl.Boolean}

@@ -18,7 +18,7 @@ class SpanState(IntEnum):
 
     RIGHT = 0
     AFTER_ALARM = 1
-    UNSEEN = 2
+    NOT_COVERED = 2
     UNKNOWN = 3
     ALARM = 4
     CONFIDENCE = 5
@@ -60,19 +60,20 @@ def states_of(epochs: pl.DataFrame, alarm_starts: pl.Series, config: Configurati
 
 
 def _is(epochs: pl.DataFrame, judgement: str) -> Bools:
+    """Which epochs have a judgement."""
     return (epochs["judgement"].cast(pl.String) == judgement).fill_null(value=False).to_numpy()
 
 
-def spans_of(epochs: pl.DataFrame, states: Ints, legs: pl.DataFrame, config: Configuration) -> pl.DataFrame:
+def spans_of(epochs: pl.DataFrame, states: Ints, stretches: pl.DataFrame, config: Configuration) -> pl.DataFrame:
     """One row per pair of epochs: `low_m, high_m` where the train may have been, `from_m, to_m` where it was most
     likely, `direction, state, t, elements` (net elements of the train there), `satellites` (the fewer of the two).
 
     Between two places that are known the worst counts of what lies between where that is a pure outage, or the
-    evidence leaves only net elements of this way (at a joint both of them): else it is unknown, for nobody knows on
+    evidence leaves only net elements between them (at a joint both of them): else it is unknown, for nobody knows on
     which piece it was. So is a place known less closely than the failure limit on both sides. What
-    was wrong at an end of such a way, or of an outage, was wrong there and not along it: a row of its own.
+    was wrong at an end of such a stretch, or of an outage, was wrong there and not along it: a row of its own.
     """
-    low, high = train_path_m(epochs, legs)
+    low, high = train_path_m(epochs, stretches)
     placed = np.flatnonzero(np.isfinite(low) & np.isfinite(high))
     t_ns = times_ns(epochs)
     satellites = floats(epochs, "satellites")
@@ -80,14 +81,16 @@ def spans_of(epochs: pl.DataFrame, states: Ints, legs: pl.DataFrame, config: Con
     here = placed[:-1]
     there = placed[1:]
     state = np.maximum(states[here], states[there])
-    silent = (t_ns[there] - t_ns[here] > crossing_gaps_ns(t_ns, config.lds)[there]) & (there == here + 1)
+    in_gap = (t_ns[there] - t_ns[here] > crossing_gaps_ns(t_ns, config.lds)[there]) & (there == here + 1)
     between = np.flatnonzero(there > here + 1)
-    state[silent] = SpanState.OUTAGE
+    state[in_gap] = SpanState.OUTAGE
     for row in between:
         inner = slice(here[row] + 1, there[row])
-        way = _way(legs, min(low[here[row]], low[there[row]]), max(high[here[row]], high[there[row]]))
-        state[row] = _between(state[row], states[inner], possible[inner], way)
-    apart = silent | (there > here + 1)
+        elements = _elements_between(
+            stretches, min(low[here[row]], low[there[row]]), max(high[here[row]], high[there[row]])
+        )
+        state[row] = _between(state[row], states[inner], possible[inner], elements)
+    apart = in_gap | (there > here + 1)
     ends = np.unique(np.concatenate([here[apart], there[apart]]))
     ends = ends[states[ends] >= SpanState.WRONG]
     here, there, state = (np.concatenate(pair) for pair in ((here, ends), (there, ends), (state, states[ends])))
@@ -109,16 +112,16 @@ def spans_of(epochs: pl.DataFrame, states: Ints, legs: pl.DataFrame, config: Con
     )
 
 
-def _way(legs: pl.DataFrame, begin_m: float, end_m: float) -> set[str]:
-    """Net elements that the way leads over between two path positions."""
-    return set(legs.filter((pl.col("last_m") >= begin_m) & (pl.col("first_m") <= end_m))["netelement_id"])
+def _elements_between(stretches: pl.DataFrame, begin_m: float, end_m: float) -> set[str]:
+    """Net elements that the path leads over between two path positions."""
+    return set(stretches.filter((pl.col("last_m") >= begin_m) & (pl.col("first_m") <= end_m))["netelement_id"])
 
 
-def _between(ends: int, inner: Ints, possible: list[list[str] | None], way: set[str]) -> int:
-    """What is known of a way whose inner epochs have no known place; `ends`: the worse of its two ends."""
+def _between(ends: int, inner: Ints, possible: list[list[str] | None], elements: set[str]) -> int:
+    """What is known of a stretch whose inner epochs have no known place; `ends`: the worse of its two ends."""
     if (inner == SpanState.OUTAGE).all():
         return int(SpanState.OUTAGE)
-    if all(names and way.issuperset(names) for names in possible):
+    if all(names and elements.issuperset(names) for names in possible):
         return int(max(ends, inner.max()))
     return int(SpanState.UNKNOWN)
 

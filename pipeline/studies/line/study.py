@@ -36,6 +36,7 @@ class LineResult:
 
     @property
     def pieces(self) -> pl.DataFrame:
+        """Classes per piece and direction."""
         return self.line.table
 
     @property
@@ -49,9 +50,20 @@ class LineResult:
 def study_line(
     out: Path, site: Site, criteria: LineCriteria, solution: str | None = None, points: pl.DataFrame | None = None
 ) -> LineResult:
-    """Classes and proposals from all complete runs of `out`.
+    """Classify pieces of track by all complete runs of a result, and propose balises.
 
-    `points`: stations and signals (`name, netelement_id, measure_m`). Raises `UsageError` for results of another site.
+    Args:
+        out: the result of a campaign.
+        site: its site.
+        criteria: lengths [m], shares and counts by which pieces of track are classified.
+        solution: one solution; None for all.
+        points: stations and signals (`name, netelement_id, measure_m` [m]), near which balises are wanted.
+
+    Returns:
+        Classes of all pieces of track, proposals of balises, and remarks.
+
+    Raises:
+        UsageError: the result is of another site.
     """
     runs, twice = distinct(_runs(out, site, solution))
     pieces = pieces_of(site, criteria.piece_m)
@@ -65,7 +77,17 @@ def study_line(
 
 
 def read_points(path: Path) -> pl.DataFrame:
-    """Stations and signals from a CSV with `name, netelement_id, measure_m`."""
+    """Read stations and signals.
+
+    Args:
+        path: a CSV file with `name, netelement_id, measure_m`.
+
+    Returns:
+        One row per point; measures [m].
+
+    Raises:
+        InputError: the file cannot be read.
+    """
     try:
         frame = pl.read_csv(path, infer_schema=False)
         return frame.select(pl.col(name).cast(dtype) for name, dtype in POINT_COLUMNS.items()).drop_nulls()
@@ -105,7 +127,7 @@ def passes_of_runs(
         passes = passes_of(epochs, passages, alarms, ground, criteria, config)
         if evidence != Evidence.REFERENCE.value:
             # Reads and odometers tell by where they are, not by how good positions are: what they miss hides nothing.
-            passes = passes.with_columns(pl.col("state").replace(int(SpanState.UNKNOWN), int(SpanState.UNSEEN)))
+            passes = passes.with_columns(pl.col("state").replace(int(SpanState.UNKNOWN), int(SpanState.NOT_COVERED)))
         parts.append(passes.with_columns(run_id=pl.lit(run)))
         errors.append(_undetected(passages, ground.pieces))
     return pl.concat(parts), pl.concat(errors).group_by("piece").agg(pl.col("largest_undetected_m").max())
@@ -119,6 +141,7 @@ def _undetected(passages: pl.DataFrame, pieces: Pieces) -> pl.DataFrame:
 
 
 def _known_points(points: pl.DataFrame | None, pieces: Pieces) -> pl.DataFrame:
+    """The points given, which must lie on net elements of the site."""
     if points is None:
         return pl.DataFrame(schema=POINT_COLUMNS)
     if strange := sorted(set(points["netelement_id"]) - set(pieces.track.index)):

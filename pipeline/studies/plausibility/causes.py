@@ -15,9 +15,9 @@ from schemas.enums import MisfitCause
 
 # Worn wheels, slip and curves: so far may a factor be off the unit that explains it; bad odometers are off by 3 %.
 _UNIT_SHARE = 0.045
-# Streams are late by so much beside what explains the lag of a clock.
+# Streams are late by so much beyond what explains the lag of a clock.
 _CLOCK_NEAR_S = 2.2
-# A few independent errors tell a sigma to so much.
+# A few independent errors show a sigma to so much.
 _ACCURACY_TIMES = 2.5
 
 
@@ -26,7 +26,7 @@ class _Fact(BaseModel):
 
 
 class ClockStep(_Fact):
-    """Clocks are wrong by 1 to `most` times `step_s`; told in `unit`."""
+    """Clocks are wrong by 1 to `most` times `step_s`; stated in `unit`."""
 
     code: MisfitCause
     step_s: int
@@ -36,7 +36,7 @@ class ClockStep(_Fact):
 
 
 class CoordinateMistake(_Fact):
-    """A way to write positions wrongly; `factors` and `exchanged` mend it, as `[[ingest.correct]]` can, but minutes."""
+    """A mistake in writing positions; `factors` and `exchanged` mend it, as `[[ingest.correct]]` can, but minutes."""
 
     code: MisfitCause
     factors: dict[str, float] = {}
@@ -61,7 +61,7 @@ class KnownCauses(_Fact):
     """All of `causes.toml`: units as how many of them make a metre (per second)."""
 
     speed_units: dict[str, float]
-    way_units: dict[str, float]
+    distance_units: dict[str, float]
     accuracy_units: dict[str, float]
     clock_steps: tuple[ClockStep, ...]
     coordinate_mistakes: tuple[CoordinateMistake, ...]
@@ -72,9 +72,9 @@ KNOWN = KnownCauses.model_validate(tomllib.loads((files(__package__) / "causes.t
 
 def explain_factor(factor: float, speed: bool) -> tuple[Cause, float] | None:
     """The unit that makes recorded values `factor` times what they should be, and its exact factor; the nearest one."""
-    units = KNOWN.speed_units if speed else KNOWN.way_units
+    units = KNOWN.speed_units if speed else KNOWN.distance_units
     name, exact = min(units.items(), key=lambda unit: abs(factor / unit[1] - 1.0))
-    # A unit so near to 1 that a bad odometer could be taken for it has to be met more exactly.
+    # A unit so near to 1 that a bad odometer could be taken for it has to be matched more exactly.
     near = min(_UNIT_SHARE, abs(exact - 1.0) / 3.0)
     return (Cause(MisfitCause.UNIT, (name,)), exact) if abs(factor / exact - 1.0) <= near else None
 
@@ -99,16 +99,16 @@ def explain_lag(lag_s: float, t_ns: int, precision_s: float) -> tuple[Cause, flo
     for step in KNOWN.clock_steps:
         count = round(abs(lag_s) / step.step_s)
         size_s = count * step.step_s
-        beside_s = abs(lag_s) - size_s
-        leaps_s = min(_leaps_beside(step, size_s, t_ns), key=lambda known_s: abs(beside_s - known_s))
-        if 1 <= count <= step.most and abs(beside_s - leaps_s) <= near_s:
+        rest_s = abs(lag_s) - size_s
+        leaps_s = min(_possible_leaps(step, size_s, t_ns), key=lambda known_s: abs(rest_s - known_s))
+        if 1 <= count <= step.most and abs(rest_s - leaps_s) <= near_s:
             words = f"{size_s / step.unit_s:g} {step.unit}" + (f" and {leaps_s:+d} s" if leaps_s else "")
             return Cause(step.code, (words,)), float(np.copysign(size_s + leaps_s, lag_s))
     return None
 
 
-def _leaps_beside(step: ClockStep, size_s: int, t_ns: int) -> list[int]:
-    """Seconds by which a clock is off beside such a step: a receiver that is weeks behind takes the leap seconds of a
+def _possible_leaps(step: ClockStep, size_s: int, t_ns: int) -> list[int]:
+    """Seconds by which a clock is off besides such a step: a receiver that is weeks behind takes the leap seconds of a
     wrong day, or none. The recorder that `t_ns` is of may be the one of the right day or of the wrong one.
     """
     if step.code is not MisfitCause.GPS_WEEK:

@@ -33,6 +33,7 @@ class Cause:
 
     @property
     def words(self) -> str:
+        """The cause as a clause."""
         sentence = MISFIT_PLACES[self.code] if isinstance(self.code, MisfitPlace) else CAUSES[self.code]
         return sentence.format(*self.figures)
 
@@ -60,6 +61,7 @@ class Check:
 
     @property
     def sentence(self) -> str:
+        """The whole comparison as a sentence."""
         return f"{self.what}: {self.found}" + (f" ({self.cause})" if self.causes else "")
 
     @property
@@ -76,10 +78,12 @@ def misfit(
 
 
 def not_checked(what: str, why: str) -> Check:
+    """A comparison that could not be made."""
     return Check(what, FitState.NOT_CHECKED, why)
 
 
 def fits(what: str, found: str) -> Check:
+    """A comparison that found nothing wrong."""
     return Check(what, FitState.FITS, found)
 
 

@@ -27,7 +27,7 @@ from schemas.run import Stream
 # Two lags so near to each other are of one clock.
 _SAME_CLOCK_S = 1.5
 # A clock with an old count of leap seconds (16 or 17 in place of 18, or none of the last three) is off by these; lags
-# of reads and odometers are known to so much beside their noise [s].
+# of reads and odometers are known to so much beyond their noise [s].
 _LEAPS_S = (2, 3)
 _WHOLE_NEAR_S = 0.3
 _LEAP_NEAR_S = 0.12
@@ -48,6 +48,7 @@ class StreamLag:
 
     @property
     def name(self) -> str:
+        """The stream as people write it."""
         return self.stream.replace("_", " ")
 
 
@@ -121,6 +122,7 @@ def _leap_of_gnss(of: Recording, lags: list[StreamLag]) -> int | None:
 
 
 def _of_leap(of: Recording, lag: StreamLag, leap_s: int) -> Check:
+    """The check of a stream that is off by the leap seconds."""
     later = "later" if lag.lag_s > 0 else "earlier"
     found = f"{lag.lag_s:+.2f} s, stamps of the {lag.name} are {later}"
     causes = (Cause(MisfitCause.LEAP_SECONDS, (f"{abs(leap_s)}",)), Cause(MisfitPlace.IN_STREAM, ("GNSS", lag.name)))
@@ -129,6 +131,7 @@ def _of_leap(of: Recording, lag: StreamLag, leap_s: int) -> Check:
 
 
 def _check(of: Recording, lag: StreamLag, of_gnss: StreamLag | None, known: bool) -> Check:
+    """Whether the clock of a stream agrees with that of the GNSS."""
     config = of.config
     what = f"clock of the {lag.name} against the GNSS"
     size_s = abs(lag.lag_s)
@@ -146,7 +149,7 @@ def _check(of: Recording, lag: StreamLag, of_gnss: StreamLag | None, known: bool
 
 
 def _large(what: str, found: str, of: Recording, lag: StreamLag, of_gnss: StreamLag | None, known: bool) -> Check:
-    """A lag that no train can have; `known`: other recorders tell whose it is."""
+    """A lag that no train can have; `known`: other recorders show whose it is."""
     clock = of_gnss or lag
     constant = Cause(MisfitCause.CONSTANT_LAG), round(clock.lag_s, 2)
     cause, exact_s = explain_lag(clock.lag_s, of.epoch_ns, min(3.0 * clock.sigma_s, 3.0)) or constant

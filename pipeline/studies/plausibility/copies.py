@@ -21,7 +21,7 @@ from schemas.enums import Fix, MisfitCause
 _WHAT = "reference against the positions"
 _ADVICE = "Leave the reference out of the run, or record one with another, better instrument."
 _AXES = ("latitude_deg", "longitude_deg")
-# Fewer moving places in common tell nothing.
+# Fewer moving places in common show nothing.
 _FEWEST = 3 * LEAST
 # Degrees, minutes and seconds of an angle are written with so many decimals; finer is rounding of the computer [deg].
 _DIGITS_DEG = sorted(unit / 10.0**decimals for unit in (1.0, 1 / 60.0, 1 / 3600.0) for decimals in range(2, 10))

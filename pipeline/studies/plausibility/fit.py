@@ -44,8 +44,9 @@ class Fit:
     def leaps_s(self, in_step: bool) -> tuple[int, ...]:
         """Whole leap seconds by which the clock of the positions may be off against the judge's recorders.
 
-        `in_step`: these and the odometer have one clock, by their ways. If that is the clock of the positions too, as
-        their ways show, a lag of their places is an error along the track: 60 m at 20 m/s look like three seconds.
+        `in_step`: these and the odometer have one clock, by their movements. If that is the clock of the positions too,
+        as their movements show, a lag of their places is an error along the track: 60 m at 20 m/s look like three
+        seconds.
         """
         if in_step and any(check.in_time == "odometer" for check in self.checks):
             return ()
@@ -75,7 +76,18 @@ def clock_advice(run: RunLog) -> str:
 
 
 def fit_run(run: RunLog, solution: str, vehicle: Vehicle, config: PlausibilityConfig, site: Site | None = None) -> Fit:
-    """Compare the streams of a cleaned run with one solution, the site and the vehicle file where there are any."""
+    """Compare the streams of a run with one solution, the site and the vehicle file where there are any.
+
+    Args:
+        run: the run, cleaned.
+        solution: name of the solution.
+        vehicle: what is known of the vehicle.
+        config: the section `plausibility` of the configuration.
+        site: the site; None: positions are not compared with the survey.
+
+    Returns:
+        The checks, in order; one that says so where hardly any position is valid.
+    """
     of = recording_of(run, solution, config, vehicle, site)
     if of is None:
         return Fit((not_checked("positions", "hardly any is valid"),))
@@ -104,6 +116,7 @@ def _checks(of: Recording) -> list[Check]:
 
 
 def with_checks(fit: Fit, checks: Sequence[Check]) -> Fit:
+    """The fit with further checks at its end."""
     return Fit((*fit.checks, *checks))
 
 

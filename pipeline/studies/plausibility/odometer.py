@@ -40,13 +40,13 @@ _COLUMNS = {"distance": "distance_m", "speed": "speed_mps"}
 _UNIT_WINDOWS = 0.6
 _PULSES_WINDOWS = 0.8
 _PULSES_FACTOR = 1.5
-# Ways over this time are compared by their signs, except those below this share of the usual one.
+# Movements over this time are compared by their signs, except those below this share of the usual one.
 _SIGN_S = 10.0
 _SIGN_LEAST = 0.2
-# The way over this time before and after a stand shows the heading, where the counter shows the same way within this
+# The movement over this time before and after a stand shows the heading, where the counter shows the same within this
 # share; headings turn back by more than this cosine: a curve of 45 degrees lies within.
 _HEADING_S = 20.0
-_HEADING_WAY = 0.3
+_HEADING_DISTANCE = 0.3
 _HEADING_COSINE = 0.7
 
 
@@ -155,7 +155,7 @@ def _sign_check(counters: dict[str, Record]) -> Check:
 
 
 def _turn_check(gnss: Places, counter: Record, pair: PairFit) -> Check:
-    """Whether the counter turns where the train does; stands beside a jump of the position show nothing."""
+    """Whether the counter turns where the train does; stands next to a jump of the position show nothing."""
     grid = gnss.instants(1.0)
     firsts, lasts = (grid[rows] for rows in runs_of(gnss.speed(grid) < MOVING_MPS))
     sides = (firsts - _HEADING_S, firsts), (lasts, lasts + _HEADING_S)
@@ -165,7 +165,7 @@ def _turn_check(gnss: Places, counter: Record, pair: PairFit) -> Check:
     with np.errstate(invalid="ignore", divide="ignore"):
         cosine = np.einsum("ij,ij->i", *moved) / sizes.prod(axis=0)
         sure = np.isfinite(cosine) & (sizes.min(axis=0) > 2.0 * MOVING_MPS * _HEADING_S)
-        sure &= np.all(np.abs(np.abs(counted) - sizes) < _HEADING_WAY * sizes, axis=0)
+        sure &= np.all(np.abs(np.abs(counted) - sizes) < _HEADING_DISTANCE * sizes, axis=0)
     reverses = sure & (cosine < -_HEADING_COSINE)
     if not reverses.any():
         return not_checked(_TURNS, "the train does not reverse on the way")
@@ -201,6 +201,7 @@ class Arrangement(NamedTuple):
     north: float
 
     def turned(self, velocity: Floats) -> Floats:
+        """Velocities as they should be, (n, 2) east and north."""
         ordered = velocity[:, ::-1] if self.exchanged else velocity
         turned: Floats = ordered * np.array([self.east, self.north])
         return turned
@@ -213,6 +214,7 @@ class Arrangement(NamedTuple):
 
     @property
     def causes(self) -> tuple[Cause, ...]:
+        """What was done to the axes."""
         signs = [name for name, sign in (("east", self.east), ("north", self.north)) if sign < 0]
         exchanged = (Cause(MisfitCause.VELOCITY_EXCHANGED),) if self.exchanged else ()
         return exchanged + ((Cause(MisfitCause.VELOCITY_SIGN, (" and ".join(signs),)),) if signs else ())
@@ -323,7 +325,7 @@ def sensors_of(run: RunLog) -> list[tuple[str, pl.DataFrame]]:
 
 
 def follows_checks(run: RunLog, solution: str, config: Configuration) -> list[Check]:
-    """Each odometer against the positions of one solution of a cleaned run."""
+    """Checks of each odometer against the positions of one solution of a cleaned run."""
     fixes = run.gnss.filter(pl.col("solution") == solution)
     return [
         follows_check(name, follows_positions(frame, fixes, config), config.evidence) for name, frame in sensors_of(run)
@@ -336,6 +338,7 @@ def origins_table(run: RunLog, vehicle: Vehicle, config: Configuration) -> pl.Da
 
 
 def _rows(run: RunLog, vehicle: Vehicle, config: Configuration) -> Iterator[tuple[str, ...]]:
+    """Rows of `COLUMNS`, one per odometer."""
     for number, (name, frame) in enumerate(sensors_of(run)):
         # The vehicle file speaks of the odometer that the LDS uses.
         of_vehicle = Vehicle() if number else vehicle
@@ -348,6 +351,7 @@ def _rows(run: RunLog, vehicle: Vehicle, config: Configuration) -> Iterator[tupl
 
 
 def _use(origin: Origin, follows: bool, used: bool) -> str:
+    """What an odometer of this origin is good for, in words; `used`: it is that of the LDS."""
     if follows:
         return say("odometers", "follows")
     if origin.independent:

@@ -16,7 +16,7 @@ _BIWEIGHT = 4.685
 _ROUNDS = 6
 # Numerics: an estimate stays where none of its parts (metres, seconds, shares) moves by more.
 _STAYS = 1e-6
-# Fewer observations tell nothing.
+# Fewer observations show nothing.
 LEAST = 6
 # Lags and factors differ where they are so many sigmas apart: windows overlap and errors last.
 SIGNIFICANT_SIGMAS = 5.0
@@ -39,11 +39,14 @@ class Regression:
 
 
 def halves_of(count: int) -> tuple[slice, slice]:
+    """The first and the second half of so many rows."""
     return slice(None, count // 2), slice(count // 2, None)
 
 
 def steady(whole: Floats, *halves: Floats) -> bool:
-    """Whether every half points the same way as the whole, and by more than half of it: a drift in one does not."""
+    """Whether every half points in the same direction as the whole, and by more than half of it: a drift in one
+    does not.
+    """
     return all(float(half @ whole) > 0.5 * float(whole @ whole) for half in halves)
 
 
@@ -83,6 +86,7 @@ def _solved(design: Floats, target: Floats, weight: Floats, least_known: float) 
     """Weighted least squares, and the variance of each part at a spread of 1 (inf where a direction is not known)."""
     parts = design.reshape(-1, design.shape[2])
     weighted = (design * weight[:, None, None]).reshape(parts.shape)
+    # Normal equations by eigenvectors: those with hardly any information are left out (pseudo-inverse).
     strengths, axes = np.linalg.eigh(weighted.T @ parts)
     known = strengths > least_known * max(float(strengths[-1]), 1e-300)
     inverse = (axes[:, known] / strengths[known]) @ axes[:, known].T
@@ -116,13 +120,13 @@ def usual(values: Floats, share: float = 0.5) -> float:
     return float(part[below] + (place - below) * (part[above] - part[below]))
 
 
-# Windows of this length tell ways to 2 % where positions scatter by 2 m; they last neither so short that stamps tell
-# little nor so long that a train does not keep its speed.
+# Windows of this length show distances to 2 % where positions scatter by 2 m; they last neither so short that stamps
+# tell little nor so long that a train does not keep its speed.
 _WINDOW_M = 150.0
 _WINDOW_LEAST_S = 8.0
 _WINDOW_MOST_S = 60.0
 _WINDOWS_OVERLAP = 4.0
-# Numerics: no more windows are looked at, evenly; longer runs tell no more of a unit or a clock.
+# Numerics: no more windows are looked at, evenly; longer runs show no more of a unit or a clock.
 _WINDOWS_MOST = 1_000
 # A window agrees on a factor within so much: positions, curves and slip together.
 _WINDOW_AGREES = 0.12
@@ -144,11 +148,11 @@ _ALIKE_SHARE = 0.07
 _ALIKE_USUAL = 0.04
 # Speeds are means over 4 s, and show a lag to half of that.
 _SPEED_LAG_S = SPEED_S / 2.0
-# Lags that are worth a closer look: so many, so far from each other [s], and those beside them: a stuck counter moves
+# Lags that are worth a closer look: so many, so far from each other [s], and those next to them: a stuck counter moves
 # a correlation by seconds.
 _CANDIDATES = 4
 _APART_S = 15.0
-_BESIDE_S = np.arange(-8.0, 9.0)
+_NEARBY_S = np.arange(-8.0, 9.0)
 # All shifts of two records are tried on their longest parts without a longer pause, of so many rows at least per time.
 _PAUSE_S = 3_600.0
 _SPARSE_S = 100.0
@@ -178,10 +182,12 @@ class PairFit:
 
     @property
     def known(self) -> bool:
+        """The scale is known."""
         return not self.reason
 
     @property
     def lag_known(self) -> bool:
+        """The lag is known, to half a second."""
         return self.known and self.lag_sigma_s < _LAG_SIGMA_S
 
     @property
@@ -220,8 +226,8 @@ def _fitted(gnss: Places, counter: Record, lag_s: float) -> PairFit:
     if end_s - begin_s < 3.0 * _WINDOW_LEAST_S:
         return PairFit(reason="nothing in common")
     starts, ends = _windows(gnss, begin_s, end_s)
-    way = gnss.way(starts, ends)
-    found = scale_and_lag(starts, ends, way, _driven(counter, lag_s))
+    distance_m = gnss.distance_m(starts, ends)
+    found = scale_and_lag(starts, ends, distance_m, _driven(counter, lag_s))
     counted = counter.gained(starts + lag_s - found.lag_s, ends + lag_s - found.lag_s)
     known = np.isfinite(counted)
     # Neither a counter that stands most of the time nor one that is reset shows what is usual.
@@ -231,7 +237,7 @@ def _fitted(gnss: Places, counter: Record, lag_s: float) -> PairFit:
     if counts.sum() < LEAST or not np.isfinite(found.scale_sigma):
         reason = "the odometer stands while the positions move" if stands else "hardly any movement in common"
         return PairFit(reason=reason, stands=stands)
-    ratio = np.abs(counted[counts]) / way[counts]
+    ratio = np.abs(counted[counts]) / distance_m[counts]
     agree = np.abs(np.log(ratio / np.median(ratio))) < _WINDOW_AGREES
     return PairFit(
         scale=found.scale if np.median(counted[counts]) > 0 else -found.scale,
@@ -244,7 +250,9 @@ def _fitted(gnss: Places, counter: Record, lag_s: float) -> PairFit:
 
 
 def _driven(counter: Record, lag_s: float) -> CounterRows:
-    """The counter as way driven, by the clock of the positions: their ways have no sign. None over a pause."""
+    """The counter as distance driven, by the clock of the positions: their distances have no sign. None over a
+    pause.
+    """
     paused = np.diff(counter.t_s) > counter.limit_s
     return CounterRows(counter.t_s - lag_s, counter.values, np.concatenate([[0.0], np.cumsum(paused)])).driven()
 
@@ -258,8 +266,8 @@ def _windows(gnss: Places, begin_s: float, end_s: float) -> tuple[Floats, Floats
     length_s = float(np.clip(_WINDOW_M / np.median(fast), _WINDOW_LEAST_S, _WINDOW_MOST_S))
     step_s = max(length_s / _WINDOWS_OVERLAP, (end_s - begin_s) / _WINDOWS_MOST)
     starts = gnss.instants(step_s, begin_s, end_s - length_s)
-    way = gnss.way(starts, starts + length_s)
-    starts = starts[np.nan_to_num(way) > max(_SLOW_SHARE * usual(way, 0.9), MOVING_MPS * length_s)]
+    distance_m = gnss.distance_m(starts, starts + length_s)
+    starts = starts[np.nan_to_num(distance_m) > max(_SLOW_SHARE * usual(distance_m, 0.9), MOVING_MPS * length_s)]
     return starts, starts + length_s
 
 
@@ -275,7 +283,7 @@ def clock_lag(gnss: Places, other: Record) -> tuple[float, str]:
     possible_s, reason = _possible_lags(gnss, other)
     if reason:
         return 0.0, reason
-    rated = [_best_beside(gnss, other, lag_s) for lag_s in possible_s]
+    rated = [_best_nearby(gnss, other, lag_s) for lag_s in possible_s]
     rated = sorted((lag for lag in rated if abs(lag[1]) > _SPEED_LAG_S), reverse=True)
     if not rated or not explains(rated[0][0], as_recorded):
         return 0.0, "" if explains(as_recorded, 0.0) else "no shift of the clocks makes the speeds agree"
@@ -285,9 +293,9 @@ def clock_lag(gnss: Places, other: Record) -> tuple[float, str]:
     return lag_s, ""
 
 
-def _best_beside(gnss: Places, other: Record, lag_s: float) -> tuple[float, float]:
+def _best_nearby(gnss: Places, other: Record, lag_s: float) -> tuple[float, float]:
     """Best agreement of the speeds near a lag, and the lag."""
-    return max((_agreement(gnss, other, near_s, _COMMON_SHARE), near_s) for near_s in (lag_s + _BESIDE_S).tolist())
+    return max((_agreement(gnss, other, near_s, _COMMON_SHARE), near_s) for near_s in (lag_s + _NEARBY_S).tolist())
 
 
 def _possible_lags(gnss: Places, other: Record) -> tuple[list[float], str]:
@@ -324,7 +332,8 @@ def _correlations(first: Floats, second: Floats) -> Floats:
     apart = [np.nan_to_num(values / max(float(np.nanmean(values)), 1e-9) - 1.0) for values in (first, second)]
 
     def at_every_shift(one: Floats, other: Floats) -> Floats:
-        # A power of two is a fast length; the other one turned round makes a correlation of a convolution.
+        """Sums of products at every shift of the one against the other, by FFT."""
+        # A power of two is a fast length; the other one reversed makes a correlation of a convolution.
         fast = 1 << (size - 1).bit_length()
         return np.fft.irfft(np.fft.rfft(one, fast) * np.fft.rfft(other[::-1], fast), fast)[:size]
 

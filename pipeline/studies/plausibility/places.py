@@ -25,7 +25,7 @@ _WRITTEN = "positions as written"
 _REFERENCE = "places of the reference against the positions"
 _SURVEY = "positions against the survey"
 _AXES = ("latitude_deg", "longitude_deg")
-# Fewer tell nothing of the clock that stamps them; positions pass a balise that is read within so much: antenna, survey
+# Fewer show nothing of the clock that stamps them; positions pass a balise that is read within so much: antenna, survey
 # and position together.
 _FEWEST_READS = 3
 _READ_M = 60.0
@@ -70,7 +70,7 @@ def reference_elsewhere(of: Recording) -> Check | None:
 
 
 def _mistake(stream: str, frame: pl.DataFrame, mends: Callable[[Points], bool]) -> tuple[Cause, str] | None:
-    """The way in which a stream's places were written wrongly, and the lines that mend it; none mend minutes."""
+    """How a stream's places were written wrongly, and the lines that mend it; none mend minutes."""
     frame = frame.filter(pl.all_horizontal(pl.col(_AXES).is_finite()))
     places = [floats(frame, axis) for axis in _AXES]
     for mistake in KNOWN.coordinate_mistakes:
@@ -91,7 +91,7 @@ def _apart_m(one: Points, other: Points) -> float:
 
 
 def reference_checks(of: Recording) -> tuple[StreamLag, list[Check]]:
-    """Clock, place and heights of the reference. A copy tells nothing."""
+    """Clock, place and heights of the reference. A copy shows nothing."""
     config = of.config
     record = of.reference
     if record is None:
@@ -138,7 +138,7 @@ def reads_lag(of: Recording, reads: pl.DataFrame, site: Site) -> StreamLag:
 
 
 def read_stamp_checks(of: Recording, reads: pl.DataFrame) -> list[Check]:
-    """Reads of a recorder that keeps whole seconds: the train may be a second of its way farther.
+    """Reads of a recorder that keeps whole seconds: the train may be a second of its movement farther.
 
     Where there is a reference it is what the judge looks at.
     """
@@ -192,6 +192,6 @@ def _height_checks(base: str, up_m: Floats, of: Recording) -> list[Check]:
     is_steady = steady(*(np.array([usual(up_m[part])]) for part in (slice(None), *halves_of(len(up_m)))))
     if abs(apart_m) <= 1.5 * of.config.shift_told_m or not is_steady:
         return [fits(what, words)]
-    # No lines: survey or reference alone cannot tell that it is right, and the other may be.
+    # No lines: survey or reference alone cannot show that it is right, and the other may be.
     advice = "Find out which of the two has the other zero or unit, and mend that one."
     return [misfit(what, words, MisfitCause.HEIGHT_ZERO, advice=advice)]

@@ -17,7 +17,9 @@ from schemas.run import RunLog, Site
 
 @frozen
 class Recording:
-    """One solution of a cleaned run, its fixes and places, and whatever it meets; each comparison is made once."""
+    """One solution of a cleaned run, its fixes and places, and whatever it is compared with; each comparison is
+    made once.
+    """
 
     run: RunLog
     solution: str
@@ -34,6 +36,7 @@ class Recording:
 
     @cached_property
     def line(self) -> SurveyLine | None:
+        """The survey; None without a site."""
         return None if self.site is None else line_of(self.site)
 
     @cached_property
@@ -49,17 +52,18 @@ class Recording:
 
     @cached_property
     def pairs(self) -> dict[str, PairFit]:
-        """Each counter against the positions."""
+        """How each counter fits the positions, by its name."""
         return {name: fit_pair(self.gnss, counter) for name, counter in self.counters.items()}
 
     def seconds(self, frame: pl.DataFrame) -> Floats:
+        """Times of a stream since the epoch of all records [s]."""
         return seconds_since(self.epoch_ns, frame)
 
 
 def recording_of(
     run: RunLog, solution: str, config: PlausibilityConfig, vehicle: Vehicle, site: Site | None
 ) -> Recording | None:
-    """None where hardly any position is valid."""
+    """The records of one solution; None where hardly any position is valid."""
     fixes = run.gnss.filter(pl.col("solution") == solution)
     gnss = places_of(fixes, int(times_ns(run.gnss)[0]))
     return None if gnss is None else Recording(run, solution, config, vehicle, site, fixes, gnss)

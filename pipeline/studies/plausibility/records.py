@@ -19,9 +19,9 @@ MOVING_MPS = 1.0
 # Pauses are bridged up to so many usual periods (loggers drop single rows), and never longer than a minute.
 _BRIDGED_PERIODS = 3.5
 _BRIDGED_S = 60.0
-# Two rows a second tell as much as ten.
+# Two rows a second show as much as ten.
 _ROW_S = 0.5
-# Fewer rows of a record tell nothing.
+# Fewer rows of a record show nothing.
 _LEAST_ROWS = 10
 
 
@@ -57,7 +57,7 @@ class Record:
         return axes[0] if self.values.ndim == 1 else np.column_stack(axes)
 
     def gained(self, begin_s: Floats, end_s: Floats) -> Floats:
-        """Signed way, or displacement, from some instants to others; NaN where it is not known."""
+        """Signed distance, or displacement, from some instants to others; NaN where it is not known."""
         gained = self.at(end_s) - self.at(begin_s)
         known = self.known(begin_s) & self.known(end_s)
         return np.where(known if gained.ndim == 1 else known[:, None], gained, np.nan)
@@ -72,7 +72,9 @@ class Record:
 
 @frozen
 class Places(Record):
-    """Positions over time, on the ellipsoid: ways at 1,000 m above it are longer by 2e-4; their heights beside."""
+    """Positions over time, on the ellipsoid: distances at 1,000 m above it are longer by 2e-4; their heights
+    separately.
+    """
 
     points: Points
     height_m: Floats
@@ -82,8 +84,10 @@ class Places(Record):
         moves: Bools = np.nan_to_num(self.speed(t_s)) > MOVING_MPS
         return moves
 
-    def way(self, begin_s: Floats, end_s: Floats) -> Floats:
-        """Way from some instants to others [m]: the chord, and by half of it what a curve adds; NaN where unknown."""
+    def distance_m(self, begin_s: Floats, end_s: Floats) -> Floats:
+        """Distance run from some instants to others [m]: the chord, and by half of it what a curve adds; NaN where
+        unknown.
+        """
         middle_s = (begin_s + end_s) / 2
         parts = (begin_s, end_s), (begin_s, middle_s), (middle_s, end_s)
         chord, first, second = (np.linalg.norm(self.gained(*part), axis=1) for part in parts)
@@ -109,14 +113,14 @@ def counters_of(odometer: pl.DataFrame, epoch_ns: int) -> dict[str, Record]:
     counters: dict[str, Record] = {}
     rows_s = seconds_since(epoch_ns, odometer)
     for name, column in ("distance", "distance_m"), ("speed", "speed_mps"):
-        way = floats(odometer, column)
-        known = np.isfinite(way)
-        t_s, way = rows_s[known], way[known]
-        if name == "speed" and way.size:
-            way = np.concatenate([[0.0], np.cumsum(0.5 * (way[1:] + way[:-1]) * np.diff(t_s))])
+        values = floats(odometer, column)
+        known = np.isfinite(values)
+        t_s, values = rows_s[known], values[known]
+        if name == "speed" and values.size:
+            values = np.concatenate([[0.0], np.cumsum(0.5 * (values[1:] + values[:-1]) * np.diff(t_s))])
         kept = _thinned(t_s)
         if kept.size >= _LEAST_ROWS:
-            counters[name] = Record(t_s[kept], way[kept])
+            counters[name] = Record(t_s[kept], values[kept])
     return counters
 
 
@@ -126,7 +130,7 @@ def seconds_since(epoch_ns: int, frame: pl.DataFrame) -> Floats:
 
 
 def _thinned(t_s: Floats) -> Ints:
-    """Of the rows some two a second."""
+    """Some two of the rows a second."""
     if t_s.size < 2 or np.median(np.diff(t_s)) >= 0.9 * _ROW_S:
         return np.arange(t_s.size)
     slot = np.floor((t_s - t_s[0]) / _ROW_S + 1e-6)

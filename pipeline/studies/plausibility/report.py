@@ -10,11 +10,12 @@ import polars as pl
 
 from pipeline.stages.clean.clean import CleanCounts, clean, require_one_journey
 from pipeline.stages.judge.epochs import under_injection
+from pipeline.stages.judge.judged import JudgedEpochs
 from pipeline.studies.plausibility.causes import explain_accuracy
 from pipeline.studies.plausibility.check import Cause, Check, FitState
 from pipeline.studies.plausibility.fit import Fit, clock_advice, fit_run, lines_of, with_checks
 from pipeline.studies.plausibility.odometer import follows_checks, origins_table, undeclared
-from schemas.arrays import Bools, Floats, floats, times_ns
+from schemas.arrays import Bools, Floats
 from schemas.config import Configuration, Vehicle
 from schemas.enums import MisfitCause
 from schemas.errors import InputError
@@ -35,7 +36,7 @@ class FitReport:
     mending: Mapping[str, str] = field(default_factory=dict)
 
     def as_dict(self) -> dict[str, object]:
-        """For programs: what keeps the run from being replayed, every check, and the lines that mend it."""
+        """The report for programs: what keeps the run from being replayed, every check, and the lines that mend it."""
         mending = self.tables.get("Lines that mend it")
         mends = [] if mending is None else mending["toml"].to_list()
         return {
@@ -104,11 +105,13 @@ def fit_report(
 
 
 def _in_order(run: RunLog) -> RunLog:
+    """The run with its streams sorted by time, for a run that `clean` refuses."""
     streams: tuple[Stream, ...] = ("gnss", "odometer", "reference", "balise_reads")
     return run.with_streams(**{name: frame.sort("t") for name in streams if (frame := run.stream(name)) is not None})
 
 
 def _checks(fits: dict[str, Fit], counts: CleanCounts) -> pl.DataFrame:
+    """One row per check of each solution, with what cleaning left out."""
     columns = ("solution", "check", "state", "found", "cause")
     rows = [
         (name, check.what, check.state.value, check.found, check.cause)
@@ -144,14 +147,13 @@ def _checks(fits: dict[str, Fit], counts: CleanCounts) -> pl.DataFrame:
 _SIGMAS_95 = 1.96
 
 
-def accuracy_checks(epochs: pl.DataFrame, faults: pl.DataFrame | None, config: Configuration) -> list[Check]:
+def accuracy_checks(epochs: JudgedEpochs, faults: pl.DataFrame | None, config: Configuration) -> list[Check]:
     """Misfits of the stated sigma and of the receiver's HPL along the track; none where they hold, or nothing shows it.
 
-    `epochs`: judged. Epochs under an injected fault, or negated, are left out: their errors are not the receiver's.
+    Epochs under an injected fault, or negated, are left out: their errors are not the receiver's.
     """
-    counted = ~under_injection(times_ns(epochs), faults, config.lds.recovery_s)
-    counted &= ~epochs["negated"].fill_null(value=False).to_numpy()
-    stated_m = {"sigma": floats(epochs, "sigma_along_m"), "hpl": floats(epochs, "hpl_m") / config.lds.ci_factor}
+    counted = ~under_injection(epochs.t_ns, faults, config.lds.recovery_s) & ~epochs.negated
+    stated_m = {"sigma": epochs.sigma_along_m, "hpl": epochs.hpl_m / config.lds.ci_factor}
     return [check for what, sigma_m in stated_m.items() for check in _check(what, sigma_m, epochs, counted, config)]
 
 
@@ -160,11 +162,12 @@ def refuted(checks: list[Check]) -> bool:
     return any(cause.code is MisfitCause.SIGMA_TOO_SMALL for check in checks for cause in check.causes)
 
 
-def _check(what: str, sigma_m: Floats, epochs: pl.DataFrame, counted: Bools, config: Configuration) -> Iterator[Check]:
-    low_m, high_m = floats(epochs, "error_low_m"), floats(epochs, "error_high_m")
+def _check(what: str, sigma_m: Floats, epochs: JudgedEpochs, counted: Bools, config: Configuration) -> Iterator[Check]:
+    """Whether a reported uncertainty agrees with the errors found."""
+    low_m, high_m = epochs.judgements.low_m, epochs.judgements.high_m
     # What it leaves possible is the worst; healthy evidence strays by a part of that.
     strays_m = config.evidence.sigma_evidence_part * 0.5 * (high_m - low_m)
-    least_m = np.maximum(np.abs(floats(epochs, "error_along_m")) - strays_m, 0.0)
+    least_m = np.maximum(np.abs(epochs.error_along_m) - strays_m, 0.0)
     most_m = np.maximum(np.abs(low_m), np.abs(high_m))
     known = counted & np.isfinite(most_m + least_m + sigma_m) & (sigma_m > 0.0)
     settings = config.evidence

@@ -50,6 +50,7 @@ class PlaceFit:
 
 
 def in_words(shift_m: tuple[float, float]) -> str:
+    """A shift (east, north) as `3 m east, 4 m south`."""
     east_m, north_m = shift_m
     east = "east" if east_m >= 0 else "west"
     north = "north" if north_m >= 0 else "south"
@@ -95,7 +96,7 @@ def _refined(gnss: Places, record: Places, lag_s: float, config: PlausibilityCon
     of_parts = (fit.estimate, *fit.halves)
     return PlaceFit(
         shift_m=(east_m, north_m),
-        # The record is ahead by so much way at its stamp: it stamps a place so much too early.
+        # The record is ahead by so much at its stamp: it stamps a place so much too early.
         lag_s=lag_s - rest_s,
         lag_sigma_s=3.0 * float(fit.sigma[0]) if fit.whole else fit.spread / float(np.linalg.norm(velocity)),
         agreeing=float(np.mean(np.linalg.norm(apart - design @ fit.estimate, axis=1) < bound)),
@@ -146,8 +147,8 @@ class SurveyLine(Polyline):
 class SurveyFit:
     """How positions lie to the track; `shift_m` is the survey's place minus the positions', east and north.
 
-    `aside_m`: usual distance beside the track as recorded; `constant`: one shift explains most of it, in both halves of
-    the run, and puts the positions on the track: a drift of them is no shift, nor is a run beside the network.
+    `aside_m`: usual distance across the track as recorded; `constant`: one shift explains most of it, in both halves of
+    the run, and puts the positions on the track: a drift of them is no shift, nor is a run off the network.
     `up_m`: the survey's height minus the positions', one by one.
     """
 
@@ -182,7 +183,7 @@ def fit_survey(gnss: Places, line: SurveyLine, near_m: float) -> SurveyFit:
         """The nearest segment of each moved position."""
         return line.nearest_sample(points.surface + np.einsum("ijk,j->ik", axes, shift_m))[1]
 
-    def beside(nearest: Ints) -> tuple[Floats, Floats, Floats]:
+    def across_track(nearest: Ints) -> tuple[Floats, Floats, Floats]:
         """Direction across the track at these segments, how far it is from each position, and its height."""
         along = np.einsum("ijk,ik->ij", axes, line.end[nearest] - line.start[nearest])
         across = np.column_stack([-along[:, 1], along[:, 0]]) / np.maximum(np.linalg.norm(along, axis=1), 1e-9)[:, None]
@@ -192,14 +193,14 @@ def fit_survey(gnss: Places, line: SurveyLine, near_m: float) -> SurveyFit:
         return across, -feet.offset_m, low_m + part * (line.height_end_m[nearest] - low_m)
 
     nearest = nearest_to(np.zeros(2))
-    across, apart, height_m = beside(nearest)
+    across, apart, height_m = across_track(nearest)
     aside_m = float(np.median(np.abs(apart)))
     for _ in range(_ROUNDS):
         shift = regressed(across[:, None, :], apart[:, None], floor=1.0, least_known=_ONE_HEADING).estimate
         before, nearest = nearest, nearest_to(shift)
         if np.array_equal(nearest, before):
             break
-        across, apart, height_m = beside(nearest)
+        across, apart, height_m = across_track(nearest)
     explained = across @ shift
     left = np.abs(apart - explained)
     is_steady = all(explained[half] @ apart[half] > 0.5 * (explained[half] ** 2).sum() for half in halves_of(len(left)))

@@ -24,7 +24,17 @@ __all__ = ["safety_tables"]
 
 
 def safety_tables(config: SafetyConfig) -> dict[str, pl.DataFrame]:
-    """Every table of the safety budget by name, in the order in which one builds on the other."""
+    """Every table of the safety budget by name, in the order in which one builds on the other.
+
+    Args:
+        config: the section `safety` of the configuration.
+
+    Returns:
+        Tables by name.
+
+    Source:
+        DIAG, TVB and LOC, as the table `errata` cites them.
+    """
     return {
         "allocation": allocation_table(config),
         "allowed_time_to_detect": allowed_table(config),

@@ -41,8 +41,17 @@ class Assessment:
 def assess(out: Address, config: Configuration | None = None, replay: Replay | None = None) -> Assessment:
     """Everything that `balise safety OUT` says, from the tables of all complete runs.
 
-    `config`: its safety budget instead of the result's own, to judge it by other service levels. All else stays as the
-    tables were made with it: limits and the time of a negation are in them. `replay`: as `sensitivity` takes it.
+    Args:
+        out: the result of a campaign.
+        config: its safety budget counts instead of the result's own, to judge it by other service levels. All else
+            stays as the tables were made with it: limits and the time of a negation are in them.
+        replay: replays the logs into a folder, as `sensitivity` takes it; None: rows that need it have no figures.
+
+    Returns:
+        Sentences, the verdict first, and tables by name.
+
+    Source:
+        DOMAIN section 6.
     """
     store.complete_runs(out)
     settings = store.read_config(out) or Configuration()
@@ -147,4 +156,5 @@ def source_files(out: Address) -> pl.DataFrame:
 
 
 def _row(kind: str, of: str, file: dict[str, Any]) -> tuple[str, str, str, int, str]:
+    """A file that the assessment rests on, as a row."""
     return kind, of, file["name"], file["bytes"], file["sha256"]

@@ -22,7 +22,7 @@ S_PER_H = 3600.0
 
 @cache
 def published(name: str, *figures: str) -> pl.DataFrame:
-    """A table that the papers print, from its file beside this one; text but for figures."""
+    """A table that the papers print, from its file next to this one; text except for `figures`."""
     table = pl.read_csv((files("pipeline.studies.safety") / f"{name}.csv").read_bytes(), infer_schema=False)
     return table.cast(dict.fromkeys(figures, pl.Float64)).with_columns(pl.col(pl.String).fill_null(""))
 
@@ -34,7 +34,7 @@ def allocation_table(config: SafetyConfig) -> pl.DataFrame:
 
 
 def levels_table(config: SafetyConfig) -> pl.DataFrame:
-    """Per service level its rate of hazards [1/h], and the published time allowed [s]."""
+    """Rate of hazards of each service level [1/h], and the published time allowed [s]."""
     rates = {level: service.hazard_rate_per_h for level, service in config.service_levels.items()}
     table = pl.DataFrame({"service_level": list(rates), "rate": list(rates.values())})
     return table.with_columns(detect_s=allowed_time_to_detect_s(config.thr_vb_per_h, pl.col("rate")))
@@ -61,7 +61,7 @@ def tolerable_gnss_rate_per_h(thr_per_h: float, time_to_detect_s: Figure, demand
 
 
 def tolerable_table(config: SafetyConfig) -> pl.DataFrame:
-    """The other way round: which hazard rate of GNSS a diagnosis of this speed could live with (TVB eq. 7)."""
+    """The reverse: which hazard rate of GNSS a diagnosis of this speed could live with (TVB eq. 7)."""
     thr = config.thr_vb_per_h
     demands = config.demands_per_hour
     time_s = pl.col("time_to_detect_s")
@@ -112,7 +112,7 @@ def demands_table(config: SafetyConfig) -> pl.DataFrame:
 
 
 def substantiation_table(config: SafetyConfig) -> pl.DataFrame:
-    """Hours [h] that show a rate at 95 %, by events seen, for THR_VB and the rate of each service level."""
+    """Hours [h] that show a rate at 95 %, by number of events, for THR_VB and each service level's rate."""
     targets = {"THR_VB": config.thr_vb_per_h} | {
         f"signal in space, {level}": service.hazard_rate_per_h for level, service in config.service_levels.items()
     }

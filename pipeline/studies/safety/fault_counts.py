@@ -41,11 +41,12 @@ def _mark_common(faults: pl.DataFrame, others: pl.DataFrame) -> pl.DataFrame:
     """`faults`, `common` where both they and one of the others at the same time are failures."""
     spans = _spans(faults).with_columns(pl.col("end").fill_null(_OPEN_END_NS)).rows()
     failed = _spans(others.filter("failed"))
-    met = pl.Series([_any_meets(failed, *span) for span in spans], dtype=pl.Boolean)
-    return faults.with_columns(common=pl.col("failed") & met)
+    coincides = pl.Series([_any_meets(failed, *span) for span in spans], dtype=pl.Boolean)
+    return faults.with_columns(common=pl.col("failed") & coincides)
 
 
 def _spans(faults: pl.DataFrame, begin: str = "begin") -> pl.DataFrame:
+    """`begin, end` of faults or alarms [ns]; an end that is open is null."""
     return faults.select(begin=pl.col(begin).to_physical(), end=pl.col("t_end").to_physical())
 
 
@@ -64,8 +65,8 @@ def fault_counts(faults: pl.DataFrame, fails: FailureLog) -> dict[str, object]:
     failed = pl.col("failed")
     missed = pl.col("missed")
     judged = pl.col("with_truth")
-    seen = faults.with_columns(t_detected=pl.Series(detected_ns, dtype=pl.Int64).cast(kind))
-    seen = seen.with_columns(missed=missed_detection())
+    detected = faults.with_columns(t_detected=pl.Series(detected_ns, dtype=pl.Int64).cast(kind))
+    detected = detected.with_columns(missed=missed_detection())
     counts = {
         "hazards": pl.len(),
         "failures": failed.sum(),
@@ -78,7 +79,7 @@ def fault_counts(faults: pl.DataFrame, fails: FailureLog) -> dict[str, object]:
     delays = [
         (moment - begin) / 1e9 for moment, (begin, _) in zip(detected_ns, ends, strict=True) if moment is not None
     ]
-    return seen.select(**counts).row(0, named=True) | {"delays_s": delays}
+    return detected.select(**counts).row(0, named=True) | {"delays_s": delays}
 
 
 def _detected_ns(fails: FailureLog, begin: int, last: int) -> int | None:
@@ -109,6 +110,7 @@ def verdict_of_both(alarm: AlarmEpisode, sides: tuple[SolutionTables, SolutionTa
 
 
 def _of_side(alarm: AlarmEpisode, side: SolutionTables, config: HazardConfig) -> Verdict:
+    """The verdict of an alarm by the errors of one solution while it stood, and shortly before."""
     since_ns = alarm.start_ns - round(config.false_alarm_lookback_s * NS_PER_S)
     part = side.epochs.filter(pl.col("t").to_physical().is_between(since_ns, alarm.end_ns))
     known = part.filter(pl.col("path_m").is_not_null())

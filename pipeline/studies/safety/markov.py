@@ -29,11 +29,14 @@ class LdsModel:
 
     @property
     def mu_per_h(self) -> float:
+        """Rate of detection and negation, 1 / T_D [1/h]."""
         return 1.0 / self.time_to_detect_h
 
 
 @frozen
 class StateProbabilities:
+    """Probabilities of the four states P0 to P3 [1]; they sum to one."""
+
     p0: float
     p1: float
     p2: float
@@ -80,6 +83,7 @@ def numeric(model: LdsModel, t_h: float) -> StateProbabilities:
     """The model solved from its generator alone, as a check on the formulas."""
     from scipy.linalg import expm
 
+    # p(t) = p(0) exp(Q t) with p(0) = (1, 0, 0, 0): the first row of the matrix exponential.
     row = expm(generator(model) * t_h)[0]
     return StateProbabilities(*(float(value) for value in row))
 
@@ -90,7 +94,7 @@ def lds_hazard_rate_per_h(hr_sbas_per_h: float, time_to_detect_s: float) -> floa
 
 
 def markov_table(config: SafetyConfig) -> pl.DataFrame:
-    """Per service level, each with its allowed T_D, at T_D and later: exact, numeric, approximated."""
+    """The model of each service level at its allowed T_D and later: exact, numeric, approximated."""
     rows = []
     for level, rate, allowed_s in levels_table(config).iter_rows():
         model = LdsModel(rate, config.diagnosis_hazard_rate_per_h, allowed_s / S_PER_H)
@@ -100,6 +104,7 @@ def markov_table(config: SafetyConfig) -> pl.DataFrame:
 
 
 def _markov_row(level: str, model: LdsModel, t_h: float, thr_per_h: float) -> dict[str, object]:
+    """The model of one service level, solved in closed form and numerically."""
     state = exact(model, t_h)
     solved = numeric(model, t_h)
     difference = max(abs(a - b) for a, b in zip(astuple(state), astuple(solved), strict=True))

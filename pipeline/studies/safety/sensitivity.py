@@ -56,11 +56,12 @@ def at_level(runs: pl.DataFrame, allowed_s: float, config: Configuration) -> pl.
 
 
 def _with_allowed(row: Row, allowed_s: float, config: Configuration) -> Row:
+    """A `runs` row with the failures, reasons and verdict of another allowed time."""
     if row["status"] == RunStatus.FAILED:
         return row
     within, beyond = level_counts(failures_in(row), allowed_s)
     counted = {**row, "failures_within_budget": within, "failures_beyond_budget": beyond}
-    reasons = reasons_of(counted, allowed_s, config.hazards.undiagnosed_share)
+    reasons = reasons_of(counted, allowed_s, config.hazards)
     return {**counted, "reasons": reasons, "verdict": verdict_of(reasons).value}
 
 
@@ -78,6 +79,7 @@ def _varied(runs: pl.DataFrame, config: Configuration, key: str, value: float, r
 
 
 def _row(key: str, value: str, runs: pl.DataFrame, how: str) -> Row:
+    """Verdict and counts over all runs, for one value of a key."""
     head = head_of(run_verdicts(runs).values())
     counts = {name: int(runs[name].sum()) for name in _COUNTS}
     return {"key": key, "value": value, "how": how, "verdict": head.word, **head.counts(), **counts}

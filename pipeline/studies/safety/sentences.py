@@ -4,16 +4,20 @@ from __future__ import annotations
 
 import polars as pl
 
-from pipeline.results.figures.head import figures_beside, head_of, run_verdicts
+from pipeline.results.figures.head import head_of, run_verdicts, verdict_figures
 from pipeline.studies.reservations import failed_runs, sentences, several_settings
 from schemas.enums import RunStatus, Verdict
-from schemas.words import beside_words, say, say_of
+from schemas.words import say, say_of, verdict_figures_words
 
 
 def verdict_statement(runs: pl.DataFrame) -> str:
-    """The verdict of the campaign with its counts and the figures beside it: the first words of what is said."""
+    """The verdict of the campaign with its counts and the figures next to it: the first words of what is said."""
     head = head_of(run_verdicts(runs).values())
-    return f"{head}." if head.verdict is None else say("safety", "verdict", head, beside_words(figures_beside(runs)))
+    return (
+        f"{head}."
+        if head.verdict is None
+        else say("safety", "verdict", head, verdict_figures_words(verdict_figures(runs)))
+    )
 
 
 def reservations(runs: pl.DataFrame, alarms: pl.DataFrame) -> list[str]:
@@ -31,16 +35,16 @@ def reservations(runs: pl.DataFrame, alarms: pl.DataFrame) -> list[str]:
 
 
 def _unjudged(runs: pl.DataFrame, alarms: pl.DataFrame) -> list[str]:
-    """Per solution: the time and the alarms that nothing could judge."""
+    """Time and alarms of each solution that nothing could judge."""
     said = []
     done = runs.filter(pl.col("status") != RunStatus.FAILED).sort("solution")
     for (solution,), rows in done.group_by("solution", maintain_order=True):
-        held_h, seen_h = (float(rows[name].sum()) / 3600.0 for name in ("held_s", "evidence_s"))
-        time = (solution, held_h - seen_h, held_h, rows["evidence"].null_count(), rows.height)
+        held_h, judged_h = (float(rows[name].sum()) / 3600.0 for name in ("held_s", "evidence_s"))
+        time = (solution, held_h - judged_h, held_h, rows["evidence"].null_count(), rows.height)
         unknown = alarms.filter((pl.col("solution") == solution) & (pl.col("verdict") == Verdict.UNKNOWN))
         doubtful = (solution, unknown.height, unknown["run_id"].n_unique())
         # Less than a second is not worth saying.
-        worth = held_h - seen_h >= 1.0 / 3600.0
+        worth = held_h - judged_h >= 1.0 / 3600.0
         said += sentences("safety", {"unchecked_time": worth and time, "unchecked_alarms": unknown.height and doubtful})
     return said
 
@@ -55,7 +59,7 @@ def slow_receivers(levels: pl.DataFrame) -> list[str]:
 
 
 def level_statements(detection: pl.DataFrame) -> list[str]:
-    """Per solution: how many failures were in use no longer than each service level allows."""
+    """How many failures of each solution were in use no longer than each service level allows."""
     unknown = pl.col("failures") - pl.col("within") - pl.col("exceeded")
     failed = detection.filter(pl.col("failures") > 0).with_columns(unknown=unknown)
     said = []

@@ -9,10 +9,11 @@ from __future__ import annotations
 
 from itertools import combinations
 
+import numpy as np
 import polars as pl
 
 from pipeline.stages.epochs.clock import Clock, held_s, holds, may_move, nominal_period_s, position_ns, trusted, uptime
-from pipeline.stages.epochs.verdicts import FailureLog, failure_log
+from pipeline.stages.epochs.verdicts import FailureLog, Verdicts, failure_log
 from pipeline.stages.monitors.single import channel_monitor, on_path_of, paired
 from pipeline.stages.run_row.bounds import independent_episodes
 from pipeline.stages.run_row.run_figures import judged as judged_epoch
@@ -55,12 +56,25 @@ class _Diagnosed:
 def side_by_side(
     epochs: pl.DataFrame, hazards: pl.DataFrame, alarms: pl.DataFrame, runs: pl.DataFrame, config: Configuration
 ) -> pl.DataFrame:
-    """What each architecture made of one run (`COUNTS`), from its tables with all solutions.
+    """What each architecture made of one run, from its tables with all solutions.
 
-    `epochs` with `EPOCH_COLUMNS`. Working is: a valid, confident, unambiguous position (of both solutions where both
-    are needed), a diagnosis that judges, and no fail now nor in the recovery time before. T_D counts from the
-    fault's onset to the first fail. A false alarm of the comparison is one while both solutions were right. A pair has
-    one row, and the time of all rows is that of the run.
+    Working is: a valid, confident, unambiguous position (of both solutions where both are needed), a diagnosis that
+    judges, and no fail now nor in the recovery time before. T_D counts from the fault's onset to the first fail. A
+    false alarm of the comparison is one while both solutions were right. A pair has one row, and the time of all rows
+    is that of the run.
+
+    Args:
+        epochs: of all solutions of the run, with `EPOCH_COLUMNS`.
+        hazards: of the run.
+        alarms: of the run.
+        runs: its rows of `runs`, one per solution.
+        config: the configuration of the result.
+
+    Returns:
+        `COUNTS`, one row per architecture and solution or pair.
+
+    Source:
+        LOC section III, Fig. 3 and 4; LOC eq. 11.
     """
     names = sorted(runs.filter(pl.col("status") != RunStatus.FAILED)["solution"].to_list())
     solutions = {name: _solution(name, epochs, hazards, alarms, runs) for name in names}
@@ -90,6 +104,7 @@ def _moving_s(epochs: pl.DataFrame) -> float | None:
 def _solution(
     name: str, epochs: pl.DataFrame, hazards: pl.DataFrame, alarms: pl.DataFrame, runs: pl.DataFrame
 ) -> SolutionTables:
+    """The tables of one solution."""
     of_solution = pl.col("solution") == name
     evidence = runs.filter(of_solution)["evidence"].cast(pl.String).to_list()
     return SolutionTables(
@@ -108,6 +123,7 @@ def _reactive(solution: SolutionTables, config: Configuration) -> _Diagnosed:
 
 
 def _evaluated(monitor: str) -> pl.Expr:
+    """The monitor has a verdict at this epoch."""
     return pl.col(f"{monitor}_state").cast(pl.String) != MonitorState.NOT_EVALUATED.value
 
 
@@ -130,6 +146,7 @@ def _composite(first: SolutionTables, second: SolutionTables, config: Configurat
 
 
 def _period_s(solution: SolutionTables) -> float:
+    """Usual time between positions [s], 0 where there are hardly any."""
     return nominal_period_s(position_ns(solution.epochs)) or 0.0
 
 
@@ -148,11 +165,11 @@ def _states(solution: SolutionTables, position: pl.Expr) -> pl.DataFrame:
 
 def _channel(epochs: pl.DataFrame, monitors: tuple[str, ...], judged: pl.Expr, config: Configuration) -> _Diagnosed:
     """`epochs`: `_states`, with the columns of `monitors` and those that `judged` takes."""
-    columns = [f"{name}_{part}" for name in monitors for part in ("state", "value", "threshold")]
-    fails = failure_log(epochs.select("t", *columns, negated=pl.lit(value=False)), config.lds.recovery_s)
     clock = Clock.of(epochs, config)
-    seen = holds(epochs, judged)
-    working = seen & holds(epochs, pl.col("trusted"))
+    verdicts = {name: Verdicts.of_table(epochs, name) for name in monitors}
+    fails = failure_log(clock.t_ns, np.zeros(clock.t_ns.size, dtype=np.bool_), verdicts, config.lds.recovery_s)
+    evaluated = holds(epochs, judged)
+    working = evaluated & holds(epochs, pl.col("trusted"))
     for span in fails.alarms:
         until_ns = span.end_ns + round(config.lds.recovery_s * 1e9)
         working &= (clock.t_ns < span.start_ns) | (clock.t_ns > until_ns)
@@ -195,7 +212,7 @@ def _redundant(first: _Diagnosed, second: _Diagnosed) -> Row:
 
 
 def _verdicts_in_table(fails: FailureLog, alarms: pl.DataFrame) -> list[Verdict]:
-    """Each alarm of the architecture has the verdict of the alarm of the replay that it began in."""
+    """Verdict of each alarm of the architecture: that of the replay's alarm that it began in."""
     spans = alarms.select(pl.col("t_start", "t_end").to_physical(), pl.col("verdict").cast(pl.String)).rows()
     return [
         next((Verdict(verdict) for start, end, verdict in spans if start <= span.start_ns <= end), Verdict.UNKNOWN)

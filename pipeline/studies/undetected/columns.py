@@ -1,4 +1,4 @@
-"""The largest unnoticed error of a ride as columns of epochs and passages, and what a run comes to."""
+"""The largest unnoticed error of a solution as columns of epochs and passages, and what a run comes to."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ import numpy as np
 import polars as pl
 
 from pipeline.stages.epochs.clock import crossing_gaps_ns
+from pipeline.stages.judge.judged import JudgedEpochs
 from pipeline.stages.monitored import MonitoredSolution
 from pipeline.studies.undetected.error import largest_errors
 from pipeline.studies.undetected.figures import Spacing, undetected_figures
@@ -14,7 +15,7 @@ from pipeline.studies.undetected.in_use import Returns, in_use_errors
 from pipeline.studies.undetected.position_tests import bounded, range_bounds, with_channel
 from pipeline.studies.undetected.spacing import largest_spacing
 from pipeline.studies.undetected.watched import NO_ROW, FaultWindow, Watched, fixes_ns, watched, windows
-from schemas.arrays import Bools, Floats, Ints, flags, floats, ints, times_ns
+from schemas.arrays import Bools, Floats, Ints, flags, floats, ints
 from schemas.config import Configuration, UndetectedConfig
 from schemas.conform import dtypes
 from schemas.enums import BaliseKind
@@ -23,7 +24,7 @@ from schemas.tables import SCALES, Epochs, Passages
 
 _OF_EPOCHS = ("undetected_{}_m", "undetected_{}_in_use_m")
 _OF_RANGE = "undetected_range_{}_m"
-_WAYS = ("ahead", "behind")
+_SIDES = ("ahead", "behind")
 
 
 @frozen
@@ -34,31 +35,42 @@ class Undetected:
     passages: pl.DataFrame
     spacing: Spacing | None = None
 
-    def figures(self, epochs: pl.DataFrame, config: Configuration) -> dict[str, object]:
-        """Columns of the `runs` row, over judged epochs; none where nothing was computed."""
-        return undetected_figures(epochs, self.spacing, config.hazards.limits.failure_m)
+    def figures(self, epochs: JudgedEpochs, config: Configuration) -> dict[str, object]:
+        """Columns of the `runs` row; none where nothing was computed."""
+        if self.spacing is None:
+            return {}
+        return undetected_figures(epochs, self.epochs, self.spacing, config.hazards.limits.failure_m)
 
 
 def unnoticed_of(monitored: MonitoredSolution) -> Undetected:
-    """The largest error that no monitor would have noticed at each epoch and passage; nulls where nobody asked.
+    """The largest error that no monitor would have noticed at each epoch and passage.
 
     Never smaller than what any fault of the definition reaches.
+
+    Args:
+        monitored: one solution with its monitors and detected balises.
+
+    Returns:
+        Columns for its epochs and passages [m], null where `undetected.compute` is not set, and the spacing of balises.
+
+    Source:
+        DOMAIN section 5.6; docs/undetected.md.
     """
     config = monitored.prepared.config
-    epochs = monitored.solution.epochs
     nothing = _nothing(Passages, monitored.lds.passages.height)
     if not config.undetected.compute:
-        return Undetected(_nothing(Epochs, epochs.height), nothing)
+        return Undetected(_nothing(Epochs, monitored.solution.epochs.height), nothing)
+    epochs = monitored.solution.epochs.table
     rows = rows_of(monitored)
     parts = windows_of(monitored, rows)
     errors = _both(rows, parts, config.undetected)
-    spacing, before_m = largest_spacing(rows, _way_m(rows, epochs), config)
-    facing = ints(epochs["direction"], unknown=1)[rows.epoch]
+    spacing, before_m = largest_spacing(rows, _driven_m(rows, epochs), config)
+    direction = ints(epochs["direction"], unknown=1)[rows.epoch]
     sizes_m = (errors.error_m, _in_use_m(monitored, rows, parts, errors), _range_m(monitored, rows, parts))
     columns = {
-        name.format(way): values
+        name.format(side): values
         for name, error_m in zip((*_OF_EPOCHS, _OF_RANGE), sizes_m, strict=True)
-        for way, values in zip(_WAYS, np.where(facing > 0, error_m, error_m[::-1]), strict=True)
+        for side, values in zip(_SIDES, np.where(direction > 0, error_m, error_m[::-1]), strict=True)
     }
     at_rows = pl.DataFrame(columns | {"physical_before_m": before_m}).fill_nan(None)
     at_epochs = np.full(epochs.height, NO_ROW)
@@ -66,13 +78,14 @@ def unnoticed_of(monitored: MonitoredSolution) -> Undetected:
     at = rows_of_passages(monitored, rows)
     of_passages = _gathered(at_rows, at).with_columns(_holding(monitored, errors, at))
     return Undetected(
-        _gathered(at_rows, at_epochs).select(name.format(way) for name in _OF_EPOCHS for way in _WAYS),
+        _gathered(at_rows, at_epochs).select(name.format(side) for name in _OF_EPOCHS for side in _SIDES),
         of_passages.select(nothing.columns),
         spacing,
     )
 
 
 def _nothing(table: type[dy.Schema], rows: int) -> pl.DataFrame:
+    """The columns of a table that are computed here, null in every row."""
     kinds = {name: kind for name, kind in dtypes(table).items() if name.startswith(("undetected_", "physical_"))}
     return pl.DataFrame([pl.Series(name, [None], dtype=kind).new_from_index(0, rows) for name, kind in kinds.items()])
 
@@ -87,7 +100,7 @@ def rows_of(monitored: MonitoredSolution) -> Watched:
     """What the monitors watched, the comparison with another solution where the fault is in one alone."""
     prepared = monitored.prepared
     config = prepared.config
-    epochs = monitored.solution.epochs
+    epochs = monitored.solution.epochs.table
     rows = watched(epochs, monitored.bank.along(), monitored.lds.held, prepared.vehicle, config)
     if config.undetected.solutions_at_fault == "all":
         return rows
@@ -95,12 +108,12 @@ def rows_of(monitored: MonitoredSolution) -> Watched:
 
 
 def windows_of(monitored: MonitoredSolution, rows: Watched) -> list[FaultWindow]:
-    """From each independent fix to the next."""
+    """Windows from each independent fix to the next."""
     prepared = monitored.prepared
     fixes = fixes_ns(
         prepared.run, monitored.lds.crossings, prepared.config.lds.starts_of_mission, prepared.config.undetected
     )
-    return windows(rows, times_ns(monitored.solution.epochs), fixes)
+    return windows(rows, monitored.solution.epochs.t_ns, fixes)
 
 
 @frozen
@@ -117,13 +130,14 @@ class _BothDirections:
 
 
 def _both(rows: Watched, parts: list[FaultWindow], config: UndetectedConfig) -> _BothDirections:
+    """The largest errors in both directions, window by window."""
     error = np.full((2, rows.rows), np.nan)
     since_ns = np.full(rows.rows, -1)
     paid = np.zeros((rows.rows, 1 + rows.weight.shape[1]))
     outright = np.zeros(rows.rows, dtype=np.bool_)
     for window in parts:
-        seen = rows.since(window.start, window.end, window.since_s)
-        ahead, behind = (largest_errors(travel, config) for travel in (seen, seen.mirrored()))
+        grown = rows.since(window.start, window.end, window.since_s)
+        ahead, behind = (largest_errors(travel, config) for travel in (grown, grown.mirrored()))
         part = slice(window.start + 1, window.end + 1)
         worse = ahead.most_m >= behind.most_m
         error[:, part] = (ahead.most_m, behind.most_m)
@@ -134,9 +148,10 @@ def _both(rows: Watched, parts: list[FaultWindow], config: UndetectedConfig) -> 
 
 
 def _in_use_m(monitored: MonitoredSolution, rows: Watched, parts: list[FaultWindow], errors: _BothDirections) -> Floats:
+    """The largest error while the position is in use, alarms or not, shape (2, rows)."""
     config = monitored.prepared.config
     vehicle = monitored.prepared.vehicle
-    epochs = monitored.solution.epochs
+    epochs = monitored.solution.epochs.table
     returns = None
     # No negated position returns between fixes without a re-link, or a vehicle file to compare with.
     if config.lds.relink and vehicle.odometer_scale is not None and vehicle.odometer_scale_sigma is not None:
@@ -145,7 +160,7 @@ def _in_use_m(monitored: MonitoredSolution, rows: Watched, parts: list[FaultWind
 
 
 def _range_m(monitored: MonitoredSolution, rows: Watched, parts: list[FaultWindow]) -> Floats:
-    """By the worst range at fault; NaN without ranges."""
+    """Error by the worst range at fault [m]; NaN without ranges."""
     satellites = monitored.prepared.ranges(monitored.solution.name)
     if satellites is None:
         return np.full((2, rows.rows), np.nan)
@@ -155,11 +170,11 @@ def _range_m(monitored: MonitoredSolution, rows: Watched, parts: list[FaultWindo
     ).error_m
 
 
-def _way_m(rows: Watched, epochs: pl.DataFrame) -> Floats:
-    """Way driven up to each row by the odometer, turns included."""
+def _driven_m(rows: Watched, epochs: pl.DataFrame) -> Floats:
+    """Distance driven up to each row by the odometer, turns included."""
     odometer_m = floats(epochs, "odometer_m")[rows.epoch]
-    way: Floats = np.cumsum(np.abs(np.diff(odometer_m, prepend=odometer_m[:1])))
-    return way
+    driven_m: Floats = np.cumsum(np.abs(np.diff(odometer_m, prepend=odometer_m[:1])))
+    return driven_m
 
 
 def rows_of_passages(monitored: MonitoredSolution, rows: Watched) -> Ints:
@@ -168,20 +183,19 @@ def rows_of_passages(monitored: MonitoredSolution, rows: Watched) -> Ints:
     Of a virtual balise the epoch that offered it. Of a physical one the last row before its telegram, no longer before
     than a crossing may be seen over: that is how wrong the position can have become since the read before.
     """
-    epoch_of = monitored.lds.crossings.select("crossing_id", "epoch")
-    seen = monitored.lds.passages.join(epoch_of, on="crossing_id", how="left", maintain_order="left")
+    passages = monitored.lds.passages
     if not rows.rows:
-        return np.full(seen.height, NO_ROW)
-    t_ns = times_ns(monitored.solution.epochs)
-    wanted = ints(seen["epoch"])
+        return np.full(passages.height, NO_ROW)
+    t_ns = monitored.solution.epochs.t_ns
+    wanted = np.append(monitored.lds.crossings.epoch, -1)[ints(passages["crossing_id"])]
     row = np.searchsorted(rows.epoch, wanted).clip(max=rows.rows - 1)
     offered = np.where((wanted >= 0) & (rows.epoch[row] == wanted), row, NO_ROW)
-    read_ns = ints(seen["t_offered"].dt.timestamp("ns"))
+    read_ns = ints(passages["t_offered"].dt.timestamp("ns"))
     stamps = t_ns[rows.epoch]
     before = np.searchsorted(stamps, read_ns, side="right") - 1
     longest_ns = crossing_gaps_ns(t_ns, monitored.prepared.config.lds)[rows.epoch]
     near = (before >= 0) & (read_ns - stamps[before.clip(0)] <= longest_ns[before.clip(0)])
-    physical = (seen["kind"].cast(pl.String) == BaliseKind.PHYSICAL.value).to_numpy()
+    physical = (passages["kind"].cast(pl.String) == BaliseKind.PHYSICAL.value).to_numpy()
     return np.where(physical, np.where(near, before, NO_ROW), offered)
 
 

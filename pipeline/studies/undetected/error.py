@@ -1,7 +1,7 @@
 """The largest error ahead at every row since the last independent fix, over resets, re-links and tests of the position.
 
-Growth over stretches adds up. Where the bank began anew the fault may have changed unseen; a re-link bounds it against
-its anchor; a monitor without memory bounds it outright, there and, with the growth since, for a while after.
+Growth over stretches adds up. Where the bank began anew the fault may have changed unobserved; a re-link bounds it
+against its anchor; a monitor without memory bounds it outright, there and, with the growth since, for a while after.
 """
 
 from __future__ import annotations
@@ -59,18 +59,19 @@ def largest_errors(
 
 
 def _across(window: Watched, row: int, most_m: Floats) -> float:
-    """The fault at a row to which the bank did not see the way, or at a re-link inside one."""
+    """The fault at a row to which the bank saw no increment, or at a re-link inside one."""
     if window.fresh[row]:
-        unseen = float(window.fastest_m[row])
+        unobserved_m = float(window.fastest_m[row])
     else:
         stretch = stretch_after(window, row - 1, row, known=row == 1)
-        unseen = float(growth_of(stretch).most_m[0]) + _learned_m(window, row)
+        unobserved_m = float(growth_of(stretch).most_m[0]) + _learned_m(window, row)
     anchor = window.anchor[row]
     at_anchor = float(most_m[anchor]) if anchor != NO_ROW else 0.0
-    return min(float(most_m[row - 1]) + unseen, at_anchor + float(window.held_high_m[row]))
+    return min(float(most_m[row - 1]) + unobserved_m, at_anchor + float(window.held_high_m[row]))
 
 
 def _learned_m(window: Watched, row: int) -> float:
+    """What learned scale and latency may hide over the step to a row [m]."""
     late_m = window.learned_late_m[row] + (window.learned_late_m[row - 1] if row > 1 else 0.0)
     return float(window.learned_m[row] + late_m)
 
@@ -89,6 +90,7 @@ def _after_levels(window: Watched, splits: After) -> Floats:
 
 
 def _unbroken(window: Watched, begins: Ints, lag: int) -> Bools:
+    """Whether the bank did not begin anew within `lag` rows after each of these."""
     broken = np.cumsum(window.fresh)
     unbroken: Bools = broken[begins + lag] == broken[begins]
     return unbroken
@@ -113,14 +115,14 @@ def _growth_at(window: Watched, begins: Ints, lag: int, shares: Floats) -> Float
     carried = np.zeros_like(threshold)  # part of the row after, as it falls to the averages here
     for row in range(lag, 0, -1):
         at = begins + row
-        way = window.way_s[at]
+        gain_s = window.gain_s[at]
         weight = window.weight[at]
         raw = shares[row - 1, 0]
-        total += way * raw * (window.most_mps[at] if raw > 0.0 else window.least_mps[at])
-        part = shares[row - 1, 1:] * way[:, None] / weight
+        total += gain_s * raw * (window.most_mps[at] if raw > 0.0 else window.least_mps[at])
+        part = shares[row - 1, 1:] * gain_s[:, None] / weight
         total += (np.abs(part - carried) * window.threshold_mps[at]).sum(axis=1)
         carried = part * (1.0 - weight)
-        total -= way * window.rate_mps[at]
+        total -= gain_s * window.rate_mps[at]
         total += window.learned_m[at]
     total += (np.abs(carried) * threshold).sum(axis=1)
     return total + window.learned_late_m[begins] + window.learned_late_m[begins + lag]

@@ -1,7 +1,7 @@
 """The largest error and its profile as a linear program over a whole window, solved exactly (HiGHS).
 
-Unknowns of each row: y (what the bank would have seen), the averages, the fault. Thresholds are bounds, recursions are
-equations, and every quantity is counted in its own bound, so that tolerances are shares of it.
+Unknowns of each row: y (what the bank would have observed), the averages, the fault. Thresholds are bounds, recursions
+are equations, and every quantity is counted in its own bound, so that tolerances are shares of it.
 """
 
 from __future__ import annotations
@@ -65,9 +65,9 @@ def largest_profile(window: Watched, margin: float = 0.0) -> Optimum:
 
 
 class _Program(NamedTuple):
-    """The linear program of one window; unknowns stand row by row: y, averages, fault, unseen growth.
+    """The linear program of one window; unknowns stand row by row: y, averages, fault, unobserved growth.
 
-    `fault`: the places of the fault; `relinks`: fault at a re-link minus fault at its anchor, both ways.
+    `fault`: the places of the fault; `relinks`: fault at a re-link minus fault at its anchor, with both signs.
     """
 
     equations: sparse.csr_matrix
@@ -80,22 +80,22 @@ class _Program(NamedTuple):
 
 
 def _program(window: Watched, margin: float) -> _Program:
-    """A_i - (1-w) A_(i-1) - w y_i = 0 for each average, and f_i - f_(i-1) - way (y_i - u_i) - unseen_i = 0."""
+    """A_i - (1-w) A_(i-1) - w y_i = 0 for each average, and f_i - f_(i-1) - gain (y_i - u_i) - unobserved_i = 0."""
     from scipy import sparse
 
     count = window.rows - 1
     averages = window.weight.shape[1]
-    seen = ~window.fresh[1:]
+    observed = ~window.fresh[1:]
     unit = sparse.identity(count)
     scale = np.maximum(np.maximum(np.abs(window.most_mps), np.abs(window.least_mps)), 1e-9)[1:]
     limits = np.where(np.isfinite(window.threshold_mps), window.threshold_mps, 1e6) * (1.0 - margin)
-    # Blocks of the matrix: an equation each, over y, each average, the fault and the unseen growth.
+    # Blocks of the matrix: an equation each, over y, each average, the fault and the unobserved growth.
     blocks: list[list[sparse.spmatrix | None]] = []
     right: list[Floats] = []
     for average in range(averages):
         limit = limits[:, average]
-        weight = np.where(seen, window.weight[1:, average], 0.0)
-        keep = np.where(seen, 1.0 - window.weight[1:, average], 0.0)
+        weight = np.where(observed, window.weight[1:, average], 0.0)
+        keep = np.where(observed, 1.0 - window.weight[1:, average], 0.0)
         carried = sparse.diags(keep[1:] * limit[1:-1] / limit[2:], -1, shape=(count, count))
         row: list[sparse.spmatrix | None] = [None] * (averages + 3)
         row[0] = sparse.diags(-weight * scale / limit[1:])
@@ -104,10 +104,10 @@ def _program(window: Watched, margin: float) -> _Program:
         begin = np.zeros(count)
         begin[0] = keep[0] * window.average_mps[0, average] / limit[1]
         right.append(begin)
-    way_s = np.where(seen, -window.way_s[1:], 0.0)
+    gain_s = np.where(observed, -window.gain_s[1:], 0.0)
     grown = unit - sparse.diags(np.ones(count - 1), -1, shape=(count, count))
-    blocks.append([sparse.diags(way_s * scale), *[None] * averages, grown, -unit])
-    right.append(way_s * window.rate_mps[1:])
+    blocks.append([sparse.diags(gain_s * scale), *[None] * averages, grown, -unit])
+    right.append(gain_s * window.rate_mps[1:])
     order = np.arange((averages + 3) * count).reshape(-1, count).T.ravel()
     relinks, relink_bounds = _relinks(window, averages + 1)
     inside = 1.0 - margin
@@ -115,7 +115,12 @@ def _program(window: Watched, margin: float) -> _Program:
     ones = [np.ones(count)] * averages
     low, high = (
         np.array(
-            [np.where(seen, inside * raw_mps[1:] / scale, 0.0), *(side * unit for unit in ones), fault_m[1:], grown_m]
+            [
+                np.where(observed, inside * raw_mps[1:] / scale, 0.0),
+                *(side * unit for unit in ones),
+                fault_m[1:],
+                grown_m,
+            ]
         )
         for side, raw_mps, fault_m, grown_m in (
             (-1.0, window.least_mps, window.low_m, -most),

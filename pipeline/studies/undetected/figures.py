@@ -4,31 +4,35 @@ from __future__ import annotations
 
 import polars as pl
 
+from pipeline.stages.judge.judged import JudgedEpochs
 from schemas.frozen import frozen
 
 
 @frozen
 class Spacing:
-    """The shortest way and time from a physical balise, wherever it is thought to be, to an error beyond the limit.
+    """The shortest distance and time from a physical balise, wherever it is thought to be, to an error beyond the
+    limit.
 
     None where no start reaches the limit before the run ends. `starts`: balises thought of; `reached`: how many of them
     reach it.
     """
 
-    way_m: float | None = None
+    distance_m: float | None = None
     time_s: float | None = None
     starts: int = 0
     reached: int = 0
 
 
-def undetected_figures(epochs: pl.DataFrame, spacing: Spacing | None, limit_m: float) -> dict[str, object]:
-    """Figures of the `runs` row, over the epochs whose position was in use; all null where nothing was computed."""
-    if spacing is None:
-        return {}
+def undetected_figures(
+    epochs: JudgedEpochs, undetected: pl.DataFrame, spacing: Spacing, limit_m: float
+) -> dict[str, object]:
+    """Figures of the `runs` row, over the epochs whose position was in use; `undetected`: its columns of `epochs`."""
     larger = pl.max_horizontal("undetected_ahead_m", "undetected_behind_m")
-    known = epochs.filter("in_use").select("t", "path_m", larger=larger).drop_nulls("larger")
+    at = {"t_ns": epochs.t_ns, "path_m": epochs.path_m, "in_use": epochs.in_use}
+    known = undetected.with_columns(larger=larger, **{name: pl.Series(values) for name, values in at.items()})
+    known = known.filter(pl.col("in_use") & larger.is_not_null())
     figures: dict[str, object] = {
-        "physical_spacing_m": spacing.way_m,
+        "physical_spacing_m": spacing.distance_m,
         "physical_spacing_s": spacing.time_s,
         "physical_spacing_starts": spacing.starts,
         "physical_spacing_reached": spacing.reached,
@@ -41,6 +45,6 @@ def undetected_figures(epochs: pl.DataFrame, spacing: Spacing | None, limit_m: f
         "undetected_p95_m": known["larger"].quantile(0.95, interpolation="higher"),
         "undetected_max_m": known["larger"].max(),
         "undetected_share_beyond": beyond.height / known.height,
-        "t_undetected_beyond": None if beyond.is_empty() else beyond["t"].dt.timestamp("ns")[0],
+        "t_undetected_beyond": None if beyond.is_empty() else beyond["t_ns"][0],
         "undetected_beyond_path_m": None if beyond.is_empty() else beyond["path_m"][0],
     }

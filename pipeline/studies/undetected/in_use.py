@@ -6,7 +6,7 @@ held to the anchor; from there on it grows by what the restarted bank lets pass,
 
     unnoticed            f(k) <= U(k)
     held to anchor A     f(k) <= U(A) + b(A, k) - (x(k) - x(A))          x: GNSS minus odometer as recorded
-    after, since h       f(k) <= f(h) + sum over (h, k] of way_s (y - u), |averages| <= thresholds
+    after, since h       f(k) <= f(h) + sum over (h, k] of gain_s (y - u), |averages| <= thresholds
 
 The anchor is the fix (a telegram; the first TVB is taken to be no worse than that), or after an outage beyond
 `gap_reset_s` a TVB before it; which one, and when the alarm came, is open: the largest counts. Before anything was
@@ -44,6 +44,7 @@ class Returns:
 
     @classmethod
     def of(cls, rows: Watched, epochs: pl.DataFrame, scale_sigma: float) -> Returns:
+        """The rows of the aligned epochs of the solution; `scale_sigma`: of the vehicle file [1]."""
         path_m, odometer_m, sigma_m, travelled_m, doubt_m = (
             floats(epochs, name)[rows.epoch]
             for name in ("path_m", "odometer_m", "position_sigma_m", "travelled_m", "odometer_doubt_m")
@@ -51,6 +52,7 @@ class Returns:
         return cls(path_m - odometer_m, sigma_m, travelled_m, doubt_m, scale_sigma)
 
     def within(self, part: slice) -> Returns:
+        """The same at some of the rows."""
         return Returns(
             self.offset_m[part],
             self.sigma_m[part],
@@ -82,11 +84,11 @@ def in_use_errors(
         if returns is None:
             errors[:, grown] = unnoticed_m[:, grown]
             continue
-        seen = rows.between(part.start, part.stop)
-        for way, sign, travel in ((0, 1.0, seen), (1, -1.0, seen.mirrored())):
-            largest_m = np.concatenate([[0.0], unnoticed_m[way, grown]])
+        within = rows.between(part.start, part.stop)
+        for side, sign, travel in ((0, 1.0, within), (1, -1.0, within.mirrored())):
+            largest_m = np.concatenate([[0.0], unnoticed_m[side, grown]])
             found = _Window(travel, returns.within(part), validated[part], sign, config)
-            errors[way, grown] = found.largest_m(largest_m)[1:]
+            errors[side, grown] = found.largest_m(largest_m)[1:]
     return errors
 
 
@@ -101,7 +103,7 @@ def _of_mission(rows: Watched, window: FaultWindow, config: Configuration) -> Bo
 class _Window:
     """One window, which begins with a fix, in one direction."""
 
-    seen: Watched
+    watched: Watched
     returns: Returns
     validated: Bools
     sign: float
@@ -120,14 +122,14 @@ class _Window:
 
     def _held_m(self, unnoticed_m: Floats, since_s: float) -> Floats:
         """The largest error at each row while it is held to an anchor, for so long since its return."""
-        reach_m = unnoticed_m + self.sign * self.returns.offset_m + self.seen.learned_late_m
+        reach_m = unnoticed_m + self.sign * self.returns.offset_m + self.watched.learned_late_m
         anchors_m = self._anchors_m(reach_m, since_s)
-        held_m: Floats = anchors_m + self._bound_m() - self.sign * self.returns.offset_m + self.seen.learned_late_m
+        held_m: Floats = anchors_m + self._bound_m() - self.sign * self.returns.offset_m + self.watched.learned_late_m
         return held_m
 
     def _anchors_m(self, reach_m: Floats, since_s: float) -> Floats:
         """The largest U(A) + x(A) of these anchors at each row."""
-        t_s = self.seen.t_s
+        t_s = self.watched.t_s
         of_tvb = np.where(self.validated, reach_m, -np.inf)
         old = np.searchsorted(t_s, t_s - self.config.align.gap_reset_s - since_s, side="right") - 1
         before_m = np.where(old >= 0, np.fmax.accumulate(of_tvb)[old], -np.inf)
@@ -143,34 +145,36 @@ class _Window:
         returns = self.returns
         rule = RecoveryRule(self.config)
         sigma_m2 = np.fmax.accumulate(returns.sigma_m) ** 2 + returns.sigma_m**2
-        waited_s = np.maximum(self.seen.t_s - self.seen.t_s[0], 0.0)
-        way_m = returns.travelled_m - returns.travelled_m[0]
-        bound_m = rule.bound_m(rule.variance_m2(sigma_m2, waited_s, way_m, returns.scale_sigma))
+        waited_s = np.maximum(self.watched.t_s - self.watched.t_s[0], 0.0)
+        driven_m = returns.travelled_m - returns.travelled_m[0]
+        bound_m = rule.bound_m(rule.variance_m2(sigma_m2, waited_s, driven_m, returns.scale_sigma))
         doubt_m = np.maximum(returns.doubt_m - returns.doubt_m[0], 0.0)
         widest_m: Floats = np.minimum(self.config.hazards.limits.relink_m, bound_m + doubt_m)
         return widest_m
 
     def _after_m(self, ended_m: Floats) -> Floats:
         """The error at each row after a hold that ended at some row before with at most `ended_m`."""
-        averages = range(self.seen.weight.shape[1])
+        averages = range(self.watched.weight.shape[1])
         least: Floats = np.min([self._grown_m(ended_m, average) for average in averages], axis=0, initial=np.inf)
         return least
 
     def _grown_m(self, ended_m: Floats, average: int) -> Floats:
-        """By one average alone: way_s y = way_s / w (A_i - (1 - w) A_(i-1)), and each |A| within its threshold."""
-        seen = self.seen
-        led = ~seen.fresh
+        """Growth by one average alone: gain_s y = gain_s / w (A_i - (1 - w) A_(i-1)), and each |A| within its
+        threshold.
+        """
+        watched = self.watched
+        led = ~watched.fresh
         # A restarted average is zero.
-        threshold = np.where(led, seen.threshold_mps[:, average], 0.0)
+        threshold = np.where(led, watched.threshold_mps[:, average], 0.0)
         known = np.isfinite(threshold)
         threshold = np.where(known, threshold, 0.0)
-        part = np.where(led, seen.way_s / seen.weight[:, average], 0.0)
-        carried = np.append((part * (1.0 - seen.weight[:, average]))[1:], 0.0)
+        part = np.where(led, watched.gain_s / watched.weight[:, average], 0.0)
+        carried = np.append((part * (1.0 - watched.weight[:, average]))[1:], 0.0)
         inner_m = np.cumsum(np.abs(part - carried) * threshold)
-        unseen_m = np.cumsum(np.where(led, seen.learned_m, seen.fastest_m))
-        recorded_m = np.cumsum(np.where(led, seen.way_s * seen.rate_mps, 0.0))
-        at_row = np.concatenate([[0.0], inner_m[:-1]]) + part * threshold + unseen_m - recorded_m
-        from_row = ended_m + carried * threshold - inner_m - unseen_m + recorded_m
+        unobserved_m = np.cumsum(np.where(led, watched.learned_m, watched.fastest_m))
+        recorded_m = np.cumsum(np.where(led, watched.gain_s * watched.rate_mps, 0.0))
+        at_row = np.concatenate([[0.0], inner_m[:-1]]) + part * threshold + unobserved_m - recorded_m
+        from_row = ended_m + carried * threshold - inner_m - unobserved_m + recorded_m
         grown = at_row + np.concatenate([[-np.inf], np.fmax.accumulate(from_row)[:-1]])
         # Where a threshold is not known any more, neither is this bound.
         lost = np.logical_or.accumulate(~known & np.isfinite(np.fmax.accumulate(ended_m)))

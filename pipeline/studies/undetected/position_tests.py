@@ -22,7 +22,7 @@ from schemas.config import Configuration, LdsConfig
 from schemas.stages import MatchedEpochs
 
 # A range that the monitor does not see at all may be wrong by any amount.
-_UNSEEN = 1e-12
+_INVISIBLE = 1e-12
 
 
 def with_channel(
@@ -37,12 +37,12 @@ def with_channel(
         return rows
     value, threshold = channel.value[rows.epoch], channel.threshold[rows.epoch]
     before = _share_before(epochs, second, lds)[rows.epoch]
-    moving = before * rows.way_s
+    moving = before * rows.gain_s
     ahead_m = moving * np.maximum(rows.most_mps - rows.rate_mps, 0.0)
     behind_m = moving * np.maximum(rows.rate_mps - rows.least_mps, 0.0)
     # The position in between is bounded only where the bank saw the step to the epoch.
-    seen = ~rows.fresh & (np.diff(rows.epoch, prepend=-1) == 1)
-    known = np.isfinite(value) & np.isfinite(threshold) & (seen | (before == 0.0))
+    observed = ~rows.fresh & (np.diff(rows.epoch, prepend=-1) == 1)
+    known = np.isfinite(value) & np.isfinite(threshold) & (observed | (before == 0.0))
     return bounded(
         rows,
         np.where(known, -threshold - value - behind_m, -np.inf),
@@ -59,8 +59,8 @@ def _share_before(epochs: pl.DataFrame, second: pl.DataFrame, lds: LdsConfig) ->
     """How far before the epoch, as a share of the step to it, this solution was compared with the other."""
     placed = pl.when(pl.col("fix_valid") & pl.col("on_track") & pl.col("path_m").is_not_null())
     numbered = epochs.with_row_index("row").select("t", path_m=placed.then(pl.col("row").cast(pl.Float64)))
-    met = paired(numbered, second.filter("fix_valid", "on_track"), lds)
-    place = floats(met, "path_m")
+    pairs = paired(numbered, second.filter("fix_valid", "on_track"), lds)
+    place = floats(pairs, "path_m")
     share: Floats = np.nan_to_num(np.arange(place.size) - place)
     return share
 
@@ -87,13 +87,13 @@ def _worst(part: Equations, threshold: Floats) -> tuple[Floats, Floats]:
     left, linear, square = _parabola(part)
     gain = _gain_along(part)
     room = np.maximum(threshold - left, 0.0)[:, None]
-    seen = part.held & (square > _UNSEEN * part.weight)
-    safe = np.where(seen, square, 1.0)
+    visible = part.held & (square > _INVISIBLE * part.weight)
+    safe = np.where(visible, square, 1.0)
     root = np.sqrt(linear**2 + safe * room)
-    reach = np.where(part.held & ~seen, np.inf, 0.0)
-    ends = [np.where(seen, (-linear + sign * root) / safe, sign * reach) for sign in (-1.0, 1.0)]
+    reach = np.where(part.held & ~visible, np.inf, 0.0)
+    ends = [np.where(visible, (-linear + sign * root) / safe, sign * reach) for sign in (-1.0, 1.0)]
     # A range without any say in the position moves nothing, however wrong.
-    moved = np.stack([np.where(np.abs(gain) > _UNSEEN, gain * end, 0.0) for end in ends])
+    moved = np.stack([np.where(np.abs(gain) > _INVISIBLE, gain * end, 0.0) for end in ends])
     low = moved.min(axis=(0, 2))
     high = moved.max(axis=(0, 2))
     untested = ~np.isfinite(threshold)
@@ -101,13 +101,15 @@ def _worst(part: Equations, threshold: Floats) -> tuple[Floats, Floats]:
 
 
 def _parabola(part: Equations) -> tuple[Floats, Floats, Floats]:
-    """SS (epochs,), and c and d of each satellite (epochs, satellites)."""
+    """SS, shape (epochs,), and c and d of each satellite, shape (epochs, satellites), as at the top of this file."""
     weighted = part.design * part.weight[..., None]
     normal = normal_of(part.design, part.weight, part.prior)
     inverse = np.linalg.inv(normal)
     right = np.einsum("eni,en->ei", weighted, part.residual_m)
     fitted = np.einsum("eni,eij,ej->en", part.design, inverse, right)
+    # With b added to satellite n the sum of squares is SS + 2 c_n b + d_n b^2; N = A' W A + prior:
     linear = part.weight * (part.residual_m - fitted)
+    # c_n = w_n (r_n - (A x)_n) above, d_n = w_n - w_n^2 (A N^-1 A')_nn.
     square = part.weight - np.einsum("eni,eij,enj->en", weighted, inverse, weighted)
     left = np.einsum("en,en->e", linear, part.residual_m)
     return left, linear, np.maximum(square, 0.0)

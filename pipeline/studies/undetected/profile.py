@@ -36,7 +36,7 @@ class FaultProfile:
 
 def profile_at(monitored: MonitoredSolution, epoch: int, behind: bool) -> FaultProfile:
     """The largest unnoticed fault at an epoch, ahead or behind in the direction of travel there."""
-    epochs = monitored.solution.epochs
+    epochs = monitored.solution.epochs.table
     rows = rows_of(monitored)
     row = int(np.searchsorted(rows.epoch, epoch))
     window = next((part for part in windows_of(monitored, rows) if part.start < row <= part.end), None)
@@ -48,8 +48,8 @@ def profile_at(monitored: MonitoredSolution, epoch: int, behind: bool) -> FaultP
         )
     against = behind != bool(ints(epochs["direction"], unknown=1)[epoch] < 0)
     part = rows.since(window.start, row, window.since_s)
-    seen = part.mirrored() if against else part
-    optimum = largest_profile(seen, MARGIN)
+    travel = part.mirrored() if against else part
+    optimum = largest_profile(travel, MARGIN)
     enabled = monitored.bank.along().enabled
     names = [name for name, on in zip(SCALES, enabled, strict=True) if on or name == "raw"]
     return FaultProfile(
@@ -58,9 +58,9 @@ def profile_at(monitored: MonitoredSolution, epoch: int, behind: bool) -> FaultP
         ),
         t=pl.Series("t", [window.since_ns, int(times_ns(epochs)[epoch])]).cast(pl.Datetime("ns", "UTC")),
         error_m=optimum.error_m,
-        bound_m=float(largest_errors(seen, monitored.prepared.config.undetected).most_m[-1]),
-        step_m=largest_of_shape(seen, "step"),
-        ramp_m=largest_of_shape(seen, "ramp"),
+        bound_m=float(largest_errors(travel, monitored.prepared.config.undetected).most_m[-1]),
+        step_m=largest_of_shape(travel, "step"),
+        ramp_m=largest_of_shape(travel, "ramp"),
         monitors=tuple(f"along_{names[which]}" if which >= 0 else "channel" for which in optimum.binding),
     )
 
@@ -70,7 +70,7 @@ def epoch_of(monitored: MonitoredSolution, balise: str | None, at_s: float | Non
     rows = rows_of(monitored)
     passages = monitored.lds.passages
     if balise is None:
-        t_ns = times_ns(monitored.solution.epochs)
+        t_ns = monitored.solution.epochs.t_ns
         stamps = t_ns[rows.epoch]
         latest = stamps[-1:].sum() if at_s is None else t_ns[0] + round(at_s * NS_PER_S)
         row = int(np.searchsorted(stamps, latest, side="right")) - 1

@@ -1,4 +1,4 @@
-"""How far apart physical balises may be: the way on which no unnoticed fault can have reached the failure limit.
+"""How far apart physical balises may be: the distance on which no unnoticed fault can have reached the failure limit.
 
 A fault that begins after a later instant is also one that begins after an earlier one. So what the run allows from one
 start on is as much as from any later start, and the starts that are tried bound all those between them.
@@ -20,10 +20,11 @@ from schemas.arrays import Floats
 from schemas.config import Configuration, UndetectedConfig
 
 
-def largest_spacing(rows: Watched, way_m: Floats, config: Configuration) -> tuple[Spacing, Floats]:
+def largest_spacing(rows: Watched, driven_m: Floats, config: Configuration) -> tuple[Spacing, Floats]:
     """The spacing of the run, and of each row how far before it a physical balise may lie [m].
 
-    `way_m`: way driven at each row. Never too large; the second is NaN where no balise of this run is too far before.
+    `driven_m`: distance driven at each row. Never too large; the second is NaN where no balise of this run is too far
+    before.
     """
     if rows.rows < 2:
         return Spacing(), np.full(rows.rows, np.nan)
@@ -35,13 +36,13 @@ def largest_spacing(rows: Watched, way_m: Floats, config: Configuration) -> tupl
     starts = np.unique(np.searchsorted(rows.t_s, np.arange(rows.t_s[0], rows.t_s[-1], step_s))).tolist()
     first_beyond = _first_rows_beyond([start for start in starts if start + 1 < rows.rows], rows.rows, search)
     shortest = partial(_shortest, first_beyond, rows.t_s, config=config.undetected, search=search)
-    ways, times = (shortest(place) for place in (way_m, rows.t_s))
+    distances, times = (shortest(place) for place in (driven_m, rows.t_s))
     reached = sum(row < rows.rows for row in first_beyond.values())
-    return Spacing(ways, times, len(first_beyond), reached), _before(first_beyond, way_m)
+    return Spacing(distances, times, len(first_beyond), reached), _before(first_beyond, driven_m)
 
 
 def _first_rows_beyond(starts: list[int], rows: int, search: Callable[[int], int]) -> dict[int, int]:
-    """By start; where the run does not reach the limit from one, it does so from no later one."""
+    """First row beyond the limit from each start; if none is reached from one, none from later ones."""
     found: dict[int, int] = {}
     reached = True
     for start in starts:
@@ -53,7 +54,7 @@ def _first_rows_beyond(starts: list[int], rows: int, search: Callable[[int], int
 def _shortest(
     first_beyond: dict[int, int], t_s: Floats, place: Floats, config: UndetectedConfig, search: Callable[[int], int]
 ) -> float | None:
-    """The shortest way (or time) from any row to the last one within the limit; `first_beyond`: first row beyond.
+    """The shortest distance (or time) from any row to the last one within the limit; `first_beyond`: first row beyond.
 
     From between two starts it is no shorter than from the second one to where the first reaches the limit. More starts
     are tried until the two agree to `spacing_close_share`, or lie within `spacing_resolution_s`; where the limit is
@@ -83,14 +84,14 @@ def _at_once(start: int, beyond: int, t_s: Floats, place: Floats, config: Undete
     return bool(place[last] <= place[start] or t_s[last] - t_s[start] <= config.spacing_resolution_s)
 
 
-def _before(first_beyond: dict[int, int], way_m: Floats) -> Floats:
+def _before(first_beyond: dict[int, int], driven_m: Floats) -> Floats:
     """How far before each row a balise keeps it within the limit: the first start that does, NaN where all do."""
     starts = np.array(sorted(first_beyond))
     beyond = np.maximum.accumulate([first_beyond[start] for start in starts])
-    rows = np.arange(way_m.size)
+    rows = np.arange(driven_m.size)
     first = np.searchsorted(beyond, rows, side="right")
     at = np.minimum(starts[np.minimum(first, starts.size - 1)], rows)
-    return np.where(first == 0, np.nan, way_m - way_m[np.where(first < starts.size, at, rows)])
+    return np.where(first == 0, np.nan, driven_m - driven_m[np.where(first < starts.size, at, rows)])
 
 
 def _first_beyond(

@@ -32,6 +32,7 @@ class _Blocks(NamedTuple):
 
     @classmethod
     def over(cls, rows: int) -> _Blocks:
+        """Blocks over so many rows, each longer than the one before."""
         edges = [0]
         while edges[-1] < rows:
             edges.append(min(edges[-1] + max(1, int(GROWTH * edges[-1])), rows))
@@ -56,7 +57,7 @@ def best_shares(stretch: GrowthStretch) -> Floats:
     from scipy.optimize import linprog
 
     blocks = _Blocks.over(stretch.rows)
-    monitors = 1 + stretch.seen.weight.shape[1]
+    monitors = 1 + stretch.watched.weight.shape[1]
     ends = 2 * blocks.first.size
     parts = [_raw(stretch, blocks), *(_average(stretch, blocks, average) for average in range(monitors - 1))]
     costs = np.concatenate([part.cost for part in parts])
@@ -89,19 +90,21 @@ class _MonitorCost(NamedTuple):
 
 
 def _raw(stretch: GrowthStretch, blocks: _Blocks) -> _MonitorCost:
-    raw_mps = np.maximum(np.abs(stretch.seen.most_mps), np.abs(stretch.seen.least_mps))
-    raw_m = np.add.reduceat(stretch.seen.way_s * _tested(raw_mps), blocks.first)
+    """What the monitor of raw differences costs a fault, split between both ends of each block."""
+    raw_mps = np.maximum(np.abs(stretch.watched.most_mps), np.abs(stretch.watched.least_mps))
+    raw_m = np.add.reduceat(stretch.watched.gain_s * _tested(raw_mps), blocks.first)
     single = blocks.first == blocks.last
     cost = np.column_stack([np.where(single, raw_m, 0.5 * raw_m), np.where(single, 0.0, 0.5 * raw_m)]).ravel()
     return _MonitorCost(np.eye(cost.size), cost, np.zeros(cost.size))
 
 
 def _average(stretch: GrowthStretch, blocks: _Blocks, average: int) -> _MonitorCost:
-    weight = stretch.seen.weight[:, average]
-    part = stretch.seen.way_s / weight
+    """What the monitor of one average costs a fault."""
+    weight = stretch.watched.weight[:, average]
+    part = stretch.watched.gain_s / weight
     # What a row gives to the average, its row before has to pay for in part; the last row has none after it.
     after = np.append((part * (1.0 - weight))[1:], 0.0)
-    at, cost = _paid_at(blocks, _tested(stretch.seen.threshold_mps[:, average]))
+    at, cost = _paid_at(blocks, _tested(stretch.watched.threshold_mps[:, average]))
     following = np.minimum(at + 1, stretch.rows - 1)
     terms = part[at, None] * blocks.lines(at) - after[at, None] * blocks.lines(following)
     start = np.eye(1, terms.shape[1]) * part[0] * (1.0 - weight[0])
@@ -126,6 +129,7 @@ def _paid_at(blocks: _Blocks, threshold: Floats) -> tuple[Ints, Floats]:
 
 
 def _tested(threshold: Floats) -> Floats:
+    """Thresholds, with a price out of reach where nothing is tested."""
     tested = np.isfinite(threshold)
     if tested.all():
         return threshold
@@ -152,7 +156,7 @@ def growth_with(stretch: GrowthStretch, splits: Iterable[Floats]) -> Growth:
     A split shares the fault out among the monitors: any bounds the growth, also one for the first rows only.
     """
     most = np.full(stretch.rows, np.inf)
-    monitors = 1 + stretch.seen.weight.shape[1]
+    monitors = 1 + stretch.watched.weight.shape[1]
     paid = np.zeros((stretch.rows, monitors))
     to_one_monitor = (np.tile(alone, (stretch.rows, 1)) for alone in np.eye(monitors))
     for shares in (*to_one_monitor, *splits):

@@ -62,7 +62,7 @@ def _grown(window: Watched, row: int, starts: Ints, before: Floats, shape: Shape
         step = np.where(starts == row, 1.0, 0.0)
     else:
         step = np.where(starts <= row, window.t_s[row] - window.t_s[row - 1], 0.0)
-    return before + step, step / window.way_s[row]
+    return before + step, step / window.gain_s[row]
 
 
 def _room(response: Floats, upper: Floats | float, lower: Floats | float) -> Floats:

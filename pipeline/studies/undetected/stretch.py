@@ -1,6 +1,7 @@
-"""A stretch: increments that the bank saw one after the other, and the bound that a way of paying for them gives.
+"""A stretch: increments that the bank saw one after the other, and the bound that a split of them among the monitors
+gives.
 
-The fault's growth over a stretch is the sum of way_s (y - u). Split each row's way_s among the monitors, in any way:
+The fault's growth over a stretch is the sum of gain_s (y - u). Split each row's gain_s among the monitors, however:
 what falls to an average is, by the average's own recursion, a sum over that average's values, and each of these is
 within its threshold. So *every* split bounds the growth from above (weak duality), and the best split gives the largest
 growth itself.
@@ -23,53 +24,56 @@ from schemas.frozen import frozen
 
 @frozen
 class GrowthStretch:
-    """`seen`: the rows after a start, to be bounded one by one.
+    """`watched`: the rows after a start, to be bounded one by one.
 
     `start_mps` (averages,): the averages at the start; `start_free_mps`: how far they may be from that.
     """
 
-    seen: Watched
+    watched: Watched
     start_mps: Floats
     start_free_mps: Floats
 
     @property
     def rows(self) -> int:
-        return self.seen.rows
+        """How many rows."""
+        return self.watched.rows
 
     def first(self, rows: int) -> GrowthStretch:
-        return replace(self, seen=self.seen.between(0, rows))
+        """Its first rows alone."""
+        return replace(self, watched=self.watched.between(0, rows))
 
     @property
     def recorded_m(self) -> Floats:
         """What the increments recorded have gathered up to each row."""
-        return np.cumsum(self.seen.way_s * self.seen.rate_mps)
+        return np.cumsum(self.watched.gain_s * self.watched.rate_mps)
 
 
 def stretch_after(rows: Watched, start: int, end: int, known: bool) -> GrowthStretch:
-    """The rows (start, end]; without `known` the averages at the start are only known to have been silent."""
+    """The rows (start, end]; without `known` the averages at the start are only known to be within their thresholds."""
     averages = rows.average_mps[start]
-    silent = rows.threshold_mps[start]
+    thresholds = rows.threshold_mps[start]
     nothing = np.zeros_like(averages)
-    seen = rows.between(start + 1, end + 1)
+    watched = rows.between(start + 1, end + 1)
     if known or rows.fresh[start]:
-        return GrowthStretch(seen, averages, nothing)
-    return GrowthStretch(seen, nothing, silent)
+        return GrowthStretch(watched, averages, nothing)
+    return GrowthStretch(watched, nothing, thresholds)
 
 
 def paid_m(stretch: GrowthStretch, shares: Floats) -> Floats:
-    """What raw (first) and each average pay for the sum of way_s y up to each row; shapes (rows, 1 + averages).
+    """What raw (first) and each average pay for the sum of gain_s y up to each row; shapes (rows, 1 + averages).
 
     `shares`: of each row, raw first; they add up to one. The sum up to a row ends there: what the last row gives to an
     average is paid by its value there.
     """
-    seen = stretch.seen
-    raw = seen.way_s * np.where(shares[:, 0] > 0.0, seen.most_mps, seen.least_mps) * shares[:, 0]
-    part = shares[:, 1:] * (seen.way_s[:, None] / seen.weight)
-    before = part * (1.0 - seen.weight)
+    watched = stretch.watched
+    raw = watched.gain_s * np.where(shares[:, 0] > 0.0, watched.most_mps, watched.least_mps) * shares[:, 0]
+    part = shares[:, 1:] * (watched.gain_s[:, None] / watched.weight)
+    # Each value A_i is paid once: |q_i / w_i - q_(i+1) (1 - w_(i+1)) / w_(i+1)| times its threshold.
+    before = part * (1.0 - watched.weight)
     inside = part.copy()
     inside[:-1] -= before[1:]
-    inner = _cost(inside, seen.threshold_mps)
-    paid = _cost(part, seen.threshold_mps)
+    inner = _cost(inside, watched.threshold_mps)
+    paid = _cost(part, watched.threshold_mps)
     paid[1:] += np.cumsum(inner[:-1], axis=0)
     paid += np.abs(before[0]) * stretch.start_free_mps - before[0] * stretch.start_mps
     return np.column_stack([np.cumsum(raw), paid])

@@ -1,7 +1,7 @@
 """The epochs of a solution as the bank along the track watched them: what a fault could do there, and what not.
 
 A fault f(t) is added to the position along growing path. From row to row the bank sees its change as a rate, on top of
-the rate u that was recorded; y = u + g df/dt is what it would have seen. Its averages are linear in y, so every
+the rate u that was recorded; y = u + g df/dt is what it would have observed. Its averages are linear in y, so every
 threshold is a linear bound on y, and the fault is what y gathers beyond u. It began after the last independent fix.
 """
 
@@ -19,12 +19,12 @@ from pipeline.stages.monitors.axis import ewma_weight
 from pipeline.stages.monitors.bank import AxisBank
 from schemas.arrays import NS_PER_S, Bools, Floats, Ints, flags, floats, times_ns
 from schemas.config import Configuration, UndetectedConfig, Vehicle
-from schemas.enums import BaliseKind
 from schemas.frozen import frozen
 from schemas.run import RunLog
+from schemas.stages import Crossings
 
 NO_ROW = -1
-_BESIDE_CURVES = ("curvature_per_m", "cross_track_m")
+_CURVE_COLUMNS = ("curvature_per_m", "cross_track_m")
 _RELINKED = ("anchor", "low_m", "high_m", "held_low_m", "held_high_m", "free")
 
 
@@ -33,9 +33,9 @@ class Watched:
     """One row per epoch that the bank used while the position was not negated, in order; all of the same length m.
 
     `epoch`: row among all epochs; `t_s`: seconds after the first epoch. `fastest_m`: by how much a fault may have
-    changed since the row before, at its largest rate. `fresh`: nothing led here, so it may have done so unseen.
-    `free`: the averages are not known here, only that they were silent.
-    `way_s`: metres of fault per m/s that the bank sees over the increment (its time over g, see `_share_seen`).
+    changed since the row before, at its largest rate. `fresh`: nothing led here, so it may have done so unobserved.
+    `free`: the averages are not known here, only that they were within their thresholds.
+    `gain_s`: metres of fault per m/s that the bank sees over the increment (its time over g, see `_share_observed`).
     `rate_mps`: u. `least_mps`, `most_mps`: bounds of y by the raw monitor and the largest rate of a fault.
     `weight`, `average_mps`, `threshold_mps` (m, averages): alpha(dt), what each average was, and its threshold.
     `low_m`, `high_m`: bounds of the fault itself by monitors without memory. `anchor`: row that a re-link held this one
@@ -48,7 +48,7 @@ class Watched:
     fresh: Bools
     free: Bools
     fastest_m: Floats
-    way_s: Floats
+    gain_s: Floats
     rate_mps: Floats
     least_mps: Floats
     most_mps: Floats
@@ -65,6 +65,7 @@ class Watched:
 
     @property
     def rows(self) -> int:
+        """How many rows."""
         return self.epoch.size
 
     def mirrored(self) -> Watched:
@@ -97,7 +98,7 @@ class Watched:
     def since(self, start: int, end: int, fix_s: float = -np.inf) -> Watched:
         """The rows from `start` to `end` for a fault that began after `fix_s`, an instant before the second of them.
 
-        Of the first increment only the time after `fix_s` has a fault: |y - u| <= df / way with that share of df.
+        Of the first increment only the time after `fix_s` has a fault: |y - u| <= df / gain with that share of df.
         """
         window = self.between(start, end + 1)
         if window.rows < 2 or fix_s <= window.t_s[0]:
@@ -107,7 +108,7 @@ class Watched:
         most = window.most_mps.copy()
         share_after_fix = (window.t_s[1] - fix_s) / (window.t_s[1] - window.t_s[0])
         fastest[1] *= share_after_fix
-        change_mps = fastest[1] / window.way_s[1]
+        change_mps = fastest[1] / window.gain_s[1]
         least[1] = max(least[1], window.rate_mps[1] - change_mps)
         most[1] = min(most[1], window.rate_mps[1] + change_mps)
         return replace(window, fastest_m=fastest, least_mps=least, most_mps=most)
@@ -128,7 +129,7 @@ def watched(
     t_s = (t_ns[epoch] - t_ns[0]) * 1e-9
     fresh = series.fresh[kept] | (np.diff(kept, prepend=-1) != 1)
     fastest_m = config.undetected.max_rate_mps * np.diff(t_s, prepend=t_s[:1])
-    way_s = series.dt_s[kept] / _share_seen(epochs, epoch, config.undetected.hidden_share)
+    gain_s = series.dt_s[kept] / _share_observed(epochs, epoch, config.undetected.hidden_share)
     rate = series.rate_mps[kept]
     threshold = _thresholds(bank, epoch, config.undetected.max_rate_mps)
     alphas = np.array(config.monitors.ewma_alphas)[bank.enabled[1:]]
@@ -140,10 +141,10 @@ def watched(
         fresh=fresh,
         free=np.zeros(epoch.size, dtype=np.bool_),
         fastest_m=fastest_m,
-        way_s=way_s,
+        gain_s=gain_s,
         rate_mps=rate,
-        least_mps=np.maximum(-threshold[:, 0], rate - fastest_m / way_s),
-        most_mps=np.minimum(threshold[:, 0], rate + fastest_m / way_s),
+        least_mps=np.maximum(-threshold[:, 0], rate - fastest_m / gain_s),
+        most_mps=np.minimum(threshold[:, 0], rate + fastest_m / gain_s),
         weight=np.ascontiguousarray(ewma_weight(alphas, series.dt_s[kept])),
         average_mps=np.where(fresh[:, None], 0.0, bank.value[epoch][:, 1:][:, bank.enabled[1:]]),
         threshold_mps=threshold[:, 1:][:, bank.enabled[1:]],
@@ -168,15 +169,15 @@ def _thresholds(bank: AxisBank, epoch: Ints, fastest_mps: float) -> Floats:
     return np.nan_to_num(threshold, nan=np.inf, posinf=np.inf, neginf=np.inf)
 
 
-def _share_seen(epochs: pl.DataFrame, epoch: Ints, most: float) -> float:
+def _share_observed(epochs: pl.DataFrame, epoch: Ints, most: float) -> float:
     """How much of a fault the increments show, at least; one on straight track.
 
-    `along_m` leaves out the way that a curve adds to a position y beside it (`alignment.align.unrolled`). A fault
-    carries the position to where the track lies otherwise, and so hides y times the turn in between: at most y times
-    the sharpest curvature times the fault.
+    `along_m` leaves out what a curve adds to the movement of a position y off the track (`alignment.align.unrolled`). A
+    fault carries the position to where the track lies otherwise, and so hides y times the turn in between: at most y
+    times the sharpest curvature times the fault.
     """
-    curvature, beside = (np.abs(np.nan_to_num(floats(epochs, name)[epoch])) for name in _BESIDE_CURVES)
-    return 1.0 - min(float(curvature.max(initial=0.0) * beside.max(initial=0.0)), most)
+    curvature, offset = (np.abs(np.nan_to_num(floats(epochs, name)[epoch])) for name in _CURVE_COLUMNS)
+    return 1.0 - min(float(curvature.max(initial=0.0) * offset.max(initial=0.0)), most)
 
 
 def _learned(epochs: pl.DataFrame, epoch: Ints, vehicle: Vehicle, config: Configuration) -> tuple[Floats, Floats]:
@@ -217,7 +218,7 @@ def _with_relinks(rows: Watched, held: tuple[Held, ...]) -> Watched:
     return replace(rows, **bounds)
 
 
-def fixes_ns(run: RunLog, crossings: pl.DataFrame, missions: tuple[datetime, ...], config: UndetectedConfig) -> Ints:
+def fixes_ns(run: RunLog, crossings: Crossings, missions: tuple[datetime, ...], config: UndetectedConfig) -> Ints:
     """Instants at which something else than GNSS said where the train was, in order [ns].
 
     Physical balises read on the path, the reference by configuration, and configured starts of mission. The run's
@@ -225,7 +226,7 @@ def fixes_ns(run: RunLog, crossings: pl.DataFrame, missions: tuple[datetime, ...
     """
     times: list[Ints] = [np.array([round(t.timestamp() * 1e9) for t in missions], dtype=np.int64)]
     if "read" in config.fixes:
-        times.append(times_ns(crossings.filter(kind=BaliseKind.PHYSICAL.value)))
+        times.append(crossings.t_ns[~crossings.virtual])
     if "reference" in config.fixes and run.reference is not None:
         times.append(times_ns(run.reference))
     return np.unique(np.concatenate(times))

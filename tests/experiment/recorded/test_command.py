@@ -9,7 +9,7 @@ import polars as pl
 import pytest
 
 from datasets.experiment.recorded import command
-from datasets.experiment.recorded.command import Made, recorded_experiment
+from datasets.experiment.recorded.command import ExperimentResult, recorded_experiment
 from datasets.trial import write_run_log, write_site
 from schemas.config import Configuration, to_toml
 from schemas.errors import BaliseError
@@ -34,7 +34,7 @@ class Bench:
 
     said: list[str]
 
-    def run(self, plan: str, out: str = "out", run: RunLog | None = None) -> Made:
+    def run(self, plan: str, out: str = "out", run: RunLog | None = None) -> ExperimentResult:
         self.said = []
         write_run_log(run or self._run, self.folder / "runs")
         (self.folder / "plan.toml").write_text(plan)

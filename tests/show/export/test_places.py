@@ -6,7 +6,7 @@ import numpy as np
 import polars as pl
 import pytest
 
-from pipeline.results.places import beside, ground_at, ground_of, plane_m, stretches_of
+from pipeline.results.places import ground_at, ground_of, offset_positions, plane_m, stretches_of
 from pipeline.show.export.positions import positions_of
 from pipeline.stages.track.geodesy import distance_m
 from tests.show.export.conftest import Result
@@ -38,7 +38,7 @@ def test_between_points_and_beyond_ends() -> None:
 @pytest.mark.parametrize(("sign", "north"), [(1.0, 3.0), (-1.0, -3.0)])
 def test_left_is_left_of_growing_path(sign: float, north: float) -> None:
     rails = ground_of(equator("A"), pl.Series(["A"]), np.array([500.0]))
-    placed = beside(rails, np.array([sign]), np.array([3.0]), np.array([2.0]))
+    placed = offset_positions(rails, np.array([sign]), np.array([3.0]), np.array([2.0]))
     east_m, north_m = plane_m(placed, (0.0, 500.0 / DEGREE_M))
     assert north_m[0] == pytest.approx(north, abs=0.05)
     assert east_m[0] == pytest.approx(0.0, abs=0.01)

@@ -306,6 +306,7 @@ def test_the_same_result_gives_the_same_bytes(out: Path, site: Site) -> None:
     assert not (out / "report" / "runs" / "gone.html").exists()
 
 
+@pytest.mark.usefixtures("forked_workers")
 def test_only_pages_of_what_changed_are_made_again(replayed: dict[str, RunTables], tmp_path: Path) -> None:
     for run_id in ("kept", "cut", "changed"):
         write_run(RunTables(**{**vars(replayed["jump_two"]), "run_id": run_id}), tmp_path, {})

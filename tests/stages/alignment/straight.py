@@ -13,6 +13,7 @@ from pipeline.stages.odometry.polarity import polarity
 from schemas.arrays import floats, times_ns
 from schemas.config import Configuration, Vehicle
 from schemas.stages import MatchedEpochs
+from tests.arrays_of_table import arrays_of_table
 from tests.tables import WHEEL
 
 SHARES = (0.083, 0.014, 0.150, 0.752)
@@ -124,9 +125,13 @@ def odometry_from(odometer, vehicle=None, config=None):
 
 def align_run(epochs, odometer, vehicle, config):
     """The epochs aligned with an odometer that the first metres turned to growing path."""
-    found = odometry_from(odometer, vehicle, config)
+    return align_with(epochs, odometry_from(odometer, vehicle, config), vehicle, config)
+
+
+def align_with(epochs, found, vehicle, config):
+    """As `align_run`, with what is known of the odometer already."""
     if found is not None:
         placed = epochs["fix_valid"].to_numpy() & epochs["on_track"].to_numpy()
         path_m = np.where(placed, floats(epochs, "path_m"), np.nan)
         found = found.oriented(polarity(found, times_ns(epochs), path_m, config.matching.orientation_distance_m))
-    return align(MatchedEpochs.of_table(epochs), found, vehicle, config).table
+    return align(arrays_of_table(MatchedEpochs, epochs), found, vehicle, config).table

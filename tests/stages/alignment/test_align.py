@@ -17,6 +17,7 @@ from pipeline.stages.odometry.quantisation import Noise, QuantisationNoise
 from schemas.arrays import NS_PER_S
 from schemas.config import Configuration, Vehicle, threshold_factor
 from schemas.stages import AlignedEpochs, MatchedEpochs
+from tests.arrays_of_table import arrays_of_table
 from tests.frames import bank_over
 from tests.stages.alignment.straight import (
     NO_NOISE,
@@ -179,7 +180,7 @@ def test_the_odometer_is_known_at_times_between_epochs_and_inside_gaps():
     start = distance(np.array([1.0, 200.0]))[0]
     expected = distance(np.array([0.5, 90.05, 110.0, 150.0, 200.0]))[:4] - start
     odometry = odometry_from(odometer, vehicle, CONFIG).oriented(-1)
-    found = odometer_at(at_ns, AlignedEpochs.of_table(aligned), odometry)
+    found = odometer_at(at_ns, arrays_of_table(AlignedEpochs, aligned), odometry)
     assert np.isnan(found[4])
     np.testing.assert_allclose(found[:4], expected, atol=2.5)
 
@@ -214,7 +215,7 @@ def test_a_long_stand_where_rows_scatter_with_the_speed_alone():
     noise = Noise(odometry.noise.white_m2_per_s, QuantisationNoise(0.0, 1e-3))
     known = replace(odometry.known_noise, moving_s2=np.full(t_s.size, 1e-3))
     scattered = replace(odometry, noise=noise, known_noise=known)
-    epochs = MatchedEpochs.of_table(epochs_of(t_s[20:-20], way_m[20:-20]))
+    epochs = arrays_of_table(MatchedEpochs, epochs_of(t_s[20:-20], way_m[20:-20]))
     aligned = align(epochs, scattered, Vehicle(), CONFIG).table
     # 0.03 s at 20 m/s, 0.6 m, counts under way alone; GNSS and odometer agree, so the scale stays 1.
     rows_m = aligned["odometer_rows_m"]
@@ -237,7 +238,7 @@ def test_the_odometer_at_any_time_goes_on_from_the_epoch_before_at_its_time_of_v
         {"t": times(np.array([10.0])), "odometer_m": [190.0], "odometer_scale": [1.0], "latency_s": [0.5]}
     )
     at_ns = np.array([9, 10, 12, 30]) * NS_PER_S
-    found = odometer_at(at_ns, AlignedEpochs.of_table(aligned), odometry)
+    found = odometer_at(at_ns, arrays_of_table(AlignedEpochs, aligned), odometry)
     assert found == pytest.approx([180.0, 200.0, 240.0, np.nan], nan_ok=True)
 
 

@@ -7,7 +7,7 @@ import polars as pl
 import pytest
 
 from pipeline.stages.epochs.clock import share_of_time
-from pipeline.stages.epochs.verdicts import AlarmEpisode, FailureLog, failure_log
+from pipeline.stages.epochs.verdicts import AlarmEpisode, FailureLog, Verdicts, failure_log
 from schemas.arrays import NS_PER_S
 
 ALARMS = (AlarmEpisode(1, 2, 10, 20, ("raw", "slow"), 2.0), AlarmEpisode(4, 4, 40, 40, ("fast",), 1.5))
@@ -62,16 +62,15 @@ def test_fails_less_than_the_recovery_time_apart_are_one_alarm() -> None:
     """Fails at 1 s, 2 s and 31 s, one alarm; at 61 s, 30 s later, and 62 s another: 1.5 and 3 times the threshold."""
     t_s = [0, 1, 2, 31, 40, 61, 62, 70]
     failing = [False, True, True, True, False, True, True, False]
-    epochs = pl.DataFrame(
+    table = pl.DataFrame(
         {
-            "t": pl.Series(t_s, dtype=pl.Int64) * NS_PER_S,
-            "negated": [False] * 8,
             "along_raw_state": ["fail" if fails else "pass" for fails in failing],
             "along_raw_value": [0.0, 2.0, -3.0, 2.0, 1.0, 2.0, 6.0, 9.0],
             "along_raw_threshold": [2.0] * 8,
         }
-    ).with_columns(pl.col("t").cast(pl.Datetime("ns", "UTC")))
-    log = failure_log(epochs, recovery_s=30.0)
+    )
+    monitors = {"along_raw": Verdicts.of_table(table, "along_raw")}
+    log = failure_log(np.array(t_s) * NS_PER_S, np.zeros(8, dtype=np.bool_), monitors, recovery_s=30.0)
     assert log.failing.tolist() == [1, 2, 3, 5, 6]
     assert log.first_monitor == ("along_raw",) * 5
     assert log.alarms == (

@@ -7,8 +7,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from pipeline.stages.evidence.anchors import Sided, reference_ways, sided
-from pipeline.stages.evidence.carrying import Counter, Lags, RecorderClock, TrueAnchor, lags_of
+from pipeline.stages.evidence.anchors import Sided, reference_movements, sided
+from pipeline.stages.evidence.carrying import Lags, RecorderClock, SignedOdometer, TrueAnchor, lags_of
 from pipeline.stages.evidence.contradictions import Witness
 from pipeline.stages.evidence.gathering import known_stretch
 from pipeline.stages.odometry import odometry_of
@@ -34,15 +34,15 @@ def stretch(t_s: Floats, at_m: Floats, forward: bool = True) -> ReferenceStretch
     return ReferenceStretch(ns(t_s), np.full(t_s.size, 0.1), (path,))
 
 
-def against(*counters: Counter) -> tuple[Witness, ...]:
+def against(*counters: SignedOdometer) -> tuple[Witness, ...]:
     """These odometers on the reference's clock, their scale within 5 %."""
     return tuple(Witness.of(counter, Lags(), CONFIG) for counter in counters)
 
 
-def counter(at_m: Floats, rate_hz: float) -> Counter:
+def counter(at_m: Floats, rate_hz: float) -> SignedOdometer:
     found = odometry_of(odometer(at_m, rate_hz), Vehicle(), CONFIG)
     assert found is not None
-    return Counter(found)
+    return SignedOdometer(found)
 
 
 @pytest.mark.parametrize("forward", [True, False])
@@ -53,7 +53,7 @@ def test_a_stretch_faces_along_its_element_as_the_odometer_counts_up(forward: bo
     at_m = 10.0 * t_s if away else 600.0 - 10.0 * t_s
     side = sided(stretch(t_s, at_m, forward), counter(10.0 * t_s, 1.0), 50.0)
     assert side.sense == (1 if away else -1)
-    assert side.facing == (8 if forward is away else 9)
+    assert side.first_oriented == (8 if forward is away else 9)
     assert (side.with_m, side.against_m) == pytest.approx((600.0, 0.0))
 
 
@@ -78,12 +78,12 @@ def test_seventy_seconds_of_changing_speed_tell_a_lag() -> None:
     t_s = np.arange(0.0, 71.0, 0.1)
     late = stretch(t_s + 0.4, np.interp(t_s, fine_s, way_m))
     counted = counter(np.interp(np.arange(0.0, 72.0, 0.1), fine_s, way_m), 10.0)
-    (found,) = lags_of(*reference_ways([Sided(late, 1, 1.0, 0.0)], no_gaps), counted, CONFIG).found
+    (found,) = lags_of(*reference_movements([Sided(late, 1, 1.0, 0.0)], no_gaps), counted, CONFIG).found
     assert found.lag_s == pytest.approx(0.4, abs=0.03)
     assert found.lag_sigma_s < 0.05
     cut = late.t_ns <= 60 * NS_PER_S
     few = ReferenceStretch(late.t_ns[cut], late.sigma_m[cut], (late.paths[0].part(slice(int(cut.sum()))),))
-    (unsure,) = lags_of(*reference_ways([Sided(few, 1, 1.0, 0.0)], no_gaps), counted, CONFIG).found
+    (unsure,) = lags_of(*reference_movements([Sided(few, 1, 1.0, 0.0)], no_gaps), counted, CONFIG).found
     assert not unsure.measured
 
 

@@ -41,7 +41,7 @@ def odometer(scale: float | None) -> Any:
 def test_a_gap_has_the_anchors_that_there_are() -> None:
     begin, end = ANCHORS
     for given in ((begin, end), (None, end), (begin, None)):
-        gap = Gap(0, 10 * NS_PER_S, *given, ways=[])
+        gap = Gap(0, 10 * NS_PER_S, *given, routes=[])
         assert gap.anchors == [anchor for anchor in given if anchor]
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from pipeline.stages.evidence.carrying import Lags, RecorderClock, clock_of, true_clocks_s
+from pipeline.stages.evidence.carrying import Lags, RecorderClock, clock_of, clocks_of, true_clocks_s
 from pipeline.stages.odometry.regression import LagState, ScaleLag
 from schemas.config import HazardConfig
 
@@ -59,3 +59,13 @@ def test_any_clock_may_be_the_true_one() -> None:
     assert true_clocks_s([RecorderClock(0.0, 0.1)]) == (0.0,)
     # Seconds of lag are gone through in steps of a second or less: the train may have sped up and braked within.
     assert true_clocks_s([RecorderClock(3.5, 0.1)]) == pytest.approx((0.0, 0.875, 1.75, 2.625, 3.5))
+
+
+def test_a_clock_that_cannot_be_measured_may_be_that_of_any_other_recorder() -> None:
+    """Lags of 4 s and -1 s are measured: a third recorder may have either, or none, each to 0.1 s."""
+    measured = [Lags((ScaleLag(1.0, 0.01, lag_s, 0.01, LagState.MEASURED),)) for lag_s in (4.0, -1.0)]
+    first, second, third = clocks_of([[measured[0]], [measured[1]], []], True, HazardConfig())
+    assert (first.shift_s, second.shift_s) == pytest.approx((4.0, -1.0))
+    assert third.assumed
+    assert third.shift_s - third.delta_s <= -1.1
+    assert third.shift_s + third.delta_s >= 4.1

@@ -7,7 +7,8 @@ import polars as pl
 import pytest
 
 from pipeline.stages.evidence import evidence_of
-from pipeline.stages.evidence.carrying import Counter, TrueAnchor, carried_forward
+from pipeline.stages.evidence.anchors import read_anchors
+from pipeline.stages.evidence.carrying import SignedOdometer, TrueAnchor, carried_forward
 from pipeline.stages.evidence.evidence import KINDS, _after_standing
 from pipeline.stages.evidence.gaps import Gap, GapSearch
 from pipeline.stages.odometry import Odometry, odometry_of
@@ -40,7 +41,7 @@ def counting(at_m: Floats) -> Odometry:
 def test_gaps_are_before_between_and_after_what_is_known() -> None:
     """The odometer counts from 0 to 10 s; the reference tells from 2 to 5 s and from 7 to 9 s."""
     a, b, c, d = (anchor(t_s, 10.0 * t_s) for t_s in (2, 5, 7, 9))
-    counter = Counter(counting(np.arange(0.0, 110.0, 10.0)))
+    counter = SignedOdometer(counting(np.arange(0.0, 110.0, 10.0)))
     found = GapSearch(counter, line("both"), Configuration()).gaps_of([(a, b), (c, d)])
     assert [(gap.begin_ns, gap.end_ns) for gap in found] == [
         tuple(seconds(*ends)) for ends in ((0, 2), (5, 7), (9, 10))
@@ -53,9 +54,9 @@ def test_where_the_odometer_slipped_a_longer_way_is_one_too(counted_mps: float, 
     """60 m in 6 s: 84 m are beyond 5 m, 5 % of the way and 6 m of noise; with 40 % of slip they are not."""
     config = Configuration(hazards=HazardConfig(slip_m=0.0, slip_share=share))
     a, b = anchor(2, 20.0), anchor(8, 80.0)
-    counter = Counter(counting(np.arange(11) * counted_mps))
+    counter = SignedOdometer(counting(np.arange(11) * counted_mps))
     _, between, _ = GapSearch(counter, line("both"), config).gaps_of([(a, a), (b, b)])
-    assert bool(between.ways) is known
+    assert bool(between.routes) is known
 
 
 READS = pl.DataFrame({"t": pl.Series([1, 6], dtype=pl.Int64) * NS_PER_S, "balise_id": ["p1", "p2"]}).with_columns(
@@ -72,7 +73,8 @@ BALISES = pl.DataFrame(
 def test_between_reads_both_tell_and_beside_them_five_metres_and_five_percent() -> None:
     """10 m each second: reads are true to 3 m at three sigmas and, by a clock of 0.1 s, to a metre more."""
     counted = counting(np.arange(0.0, 110.0, 10.0))
-    known = evidence_of(([], []), READS, BALISES, [counted], line("both"), Vehicle(), Configuration())
+    reads = read_anchors(READS, BALISES, line("both").track, HazardConfig())
+    known = evidence_of(([], []), [reads], [counted], line("both"), Vehicle(), Configuration())
     found = known.at(seconds(0, 3, 8))
     assert found.kind.tolist() == [KINDS.index(Kind.BALISE)] * 3
     rows = {int(row): (low, high) for one in found.alternatives for row, low, high in zip(

@@ -84,7 +84,7 @@ def test_beside_every_track_is_silence_and_nothing_is_known() -> None:
     found = known(place, of_reference=samples(X_M, np.full(X_M.size, -1.55)))
     assert set(found.at(found.reads_ns).kind.tolist()) == set()
     assert found.stretches == ()
-    assert len(found.silent) == 1
+    assert len(found.off_track) == 1
 
 
 APART = site({"a": line((0.0, 0.0), (3000.0, 0.0)), "b": line((0.0, 12.0), (3000.0, 12.0))}, sigma_m=1.0)

@@ -12,6 +12,7 @@ import numpy as np
 import polars as pl
 
 from pipeline.stages.evidence import EvidenceSet, TrainEvidence, evidence_of
+from pipeline.stages.evidence.anchors import read_anchors
 from pipeline.stages.odometry import odometry_of
 from pipeline.stages.reference import reference_stretches
 from pipeline.stages.track.network import network_in_pieces, site_network
@@ -130,7 +131,8 @@ def known(
     stretches = reference_stretches(of_reference, network_in_pieces(ground), network.track.index, config)
     made = [odometry_of(one, vehicle if not number else Vehicle(), config) for number, one in enumerate(odometers)]
     counters = [one for one in made if one is not None]
-    return evidence_of(stretches, of_reads, ground.balises, counters, network, vehicle, config)
+    reads = read_anchors(of_reads, ground.balises, network.track, config.hazards)
+    return evidence_of(stretches, [reads], counters, network, vehicle, config)
 
 
 def bounds(found: EvidenceSet, x_m: Floats) -> tuple[Floats, Floats, Bools]:

@@ -10,6 +10,7 @@ import numpy as np
 import polars as pl
 import pytest
 
+from pipeline.stages.epochs.monitored import MonitoredEpochs
 from pipeline.stages.epochs.verdicts import AlarmEpisode, FailureLog
 from pipeline.stages.evidence.evidence import KINDS, NOTHING, Alternative, EvidenceSet
 from pipeline.stages.judge.episodes import (
@@ -29,6 +30,7 @@ from pipeline.stages.judge.episodes import (
 )
 from pipeline.stages.judge.epochs import (
     OdometerSteps,
+    TimeInUse,
     beyond_confidence,
     cross_errors,
     lds_states,
@@ -41,7 +43,6 @@ from pipeline.stages.judge.failures import (
     ErrorHistory,
     Failure,
     Jump,
-    Offers,
     find_failures,
     find_jumps,
     steps_of,
@@ -51,17 +52,14 @@ from pipeline.stages.judge.hazards import HazardRow, _evidence, crossed_by, haza
 from pipeline.stages.judge.judge import (
     TrueCrossing,
     _true_times,
-    _with_failures,
     _within_gap,
     between_far_epochs,
+    failures_of,
     true_crossings,
 )
+from pipeline.stages.judge.judged import RIGHT, UNKNOWN, WRONG, Judgements
 from pipeline.stages.judge.judgement import (
-    RIGHT,
-    UNKNOWN,
-    WRONG,
     JudgeInput,
-    Judgements,
     MatchedPositions,
     Solution,
     judge_positions,
@@ -70,7 +68,9 @@ from pipeline.stages.judge.judgement import (
 )
 from pipeline.stages.track.path import Place, RoutePath
 from schemas.config import Configuration, HazardConfig, LdsConfig, Vehicle
-from schemas.enums import Evidence, Hazard, Judgement, Suspect, Verdict
+from schemas.enums import Evidence, Hazard, Judgement, LdsState, PassageStatus, Suspect, Verdict
+from schemas.stages import Crossings
+from tests.arrays_of_table import arrays_of_table
 from tests.stages.judge.frames import NS, history, offers, positions
 
 EPISODE = Episode(
@@ -114,7 +114,7 @@ def test_a_budget_is_kept_where_nothing_wrong_was_accepted_in_the_failure(
 ) -> None:
     """From the third of eight positions on."""
     offered = offers([epoch], judgement=judged, accepted=accepted)
-    worst = Offers.of(offered, positions(range(8))).worst_accepted(2, 8)
+    worst = history(positions(range(8)), offered=offered).worst_accepted(2, 8)
     assert within_budget(0.2, may_s, worst, 0.5) is kept
 
 
@@ -161,9 +161,10 @@ def test_an_alarm_is_false_only_where_all_of_its_positions_were_well(
 def errors_across(fixes: pl.DataFrame, heading_deg: Any, at_s: list[float], reference: pl.DataFrame) -> list[Any]:
     absent: Any = None
     stamps = pl.DataFrame({"t": seconds(*at_s)}).cast(pl.Datetime("ns", "UTC"))
-    solution = Solution("primary", fixes, stamps, absent, absent, absent, absent)
+    epochs = arrays_of_table(MonitoredEpochs, stamps)
+    solution = Solution("primary", fixes, epochs, absent, absent, absent, absent)
     given = JudgeInput(solution, absent, None, Vehicle(), Configuration(), reference)
-    return [column.fill_null(np.nan).to_numpy() for column in cross_errors(given, heading_deg)]
+    return list(cross_errors(given, heading_deg))
 
 
 def test_errors_across_are_left_of_growing_path_and_upwards() -> None:
@@ -295,8 +296,8 @@ def test_a_jump_back_leads_to_a_place_that_is_not_wrong(
     low_m = np.where(np.arange(2) == 0, middle_m, size_m)
     kind, track = np.zeros(2, dtype=np.int64), np.zeros(2, dtype=bool)
     judged = Judgements(np.array([WRONG, code]), low_m, low_m, kind, track, np.zeros(2, dtype=bool))
-    judged_course = replace(history(positions(range(2))), judged=judged)
-    assert bool(_is_back(judged_course, Jump(1, 1, step_m))) is back
+    of_judged = history(replace(positions(range(2)), judgements=judged))
+    assert bool(_is_back(of_judged, Jump(1, 1, step_m))) is back
 
 
 @pytest.mark.parametrize(("may_s", "detected_s"), [(104.5, 107.0), (None, 107.0), (104.5, None)])
@@ -332,11 +333,10 @@ def test_who_is_suspected(
 ) -> None:
     """Ten epochs, of which the sixth tells; an alarm at 6 s. The odometer and the Doppler are silent."""
     told = np.arange(10) == 5
-    silent = pl.lit(None, pl.Float64)
     epochs = positions(
-        range(10), np.where(told, error_m, 0.0), 0.0, evidence=kind.value, stood=told & stood,
-        odometer_wrong=told & counted_wrong, unambiguous=~told | sure,
-    ).with_columns(odometer_m=silent, velocity_along_mps=silent)  # fmt: skip
+        range(10), np.where(told, error_m, 0.0), 0.0, evidence=kind.value, odometer_stood=told & stood,
+        odometer_wrong=told & counted_wrong, gate_probability=np.where(~told | sure, 1.0, 0.5),
+    )  # fmt: skip
     assert suspect_of(epochs, 6 * NS, 6 * NS, Configuration()) is suspect
     # What was before the time looked back on does not count.
     late = 70 * NS
@@ -419,14 +419,16 @@ def test_the_odometer_since_a_balise_shows_only_what_was_wrong() -> None:
     assert turned.high_m[[0, 1, 5]].tolist() == [25.0, -21.0, 31.0]
 
 
-def used(t_s: Sequence[float], code: Sequence[int] | int, **columns: Any) -> pl.DataFrame:
+def used(t_s: Sequence[float], code: Sequence[int] | int, **columns: Any) -> TimeInUse:
     """Time in use of good positions at these times."""
     size = len(t_s)
     plain = {"path_m": 1.0, "on_track": True, "gate_probability": 1.0, "confidence_m": 5.0}
-    plain |= {"negated": False, "withheld": False}
+    plain |= {"negated": False, "withheld_for": None}
     values = {name: value if isinstance(value, list) else [value] * size for name, value in (plain | columns).items()}
     stamps = pl.Series("t", [round(t * NS) for t in t_s], dtype=pl.Int64).cast(pl.Datetime("ns", "UTC"))
-    return time_in_use(pl.DataFrame({"t": stamps, **values}), np.broadcast_to(code, size), Configuration())
+    values["withheld_for"] = pl.Series(values["withheld_for"], dtype=pl.String)
+    epochs = arrays_of_table(MonitoredEpochs, pl.DataFrame({"t": stamps, **values}))
+    return time_in_use(epochs, np.broadcast_to(code, size), Configuration())
 
 
 def test_a_position_is_in_use_since_the_one_before_it_until_it_is_negated() -> None:
@@ -436,19 +438,19 @@ def test_a_position_is_in_use_since_the_one_before_it_until_it_is_negated() -> N
     found = used(t_s, RIGHT, **given)
     # Each second counts for the position at its end; of the gap no more than a step that is none, however wrong.
     in_use_s = [1.0, 1.0, 1.0, 1.5, 1.0, 1.0, 1.0, 0.0, 0.0, 0.0]
-    assert found["used_s"].to_list() == in_use_s
-    assert found["in_use"].to_list() == [True] * 7 + [False] * 3
-    assert found["counted_s"].to_list() == [1.0] * 3 + [1.5] + [1.0] * 6
-    assert used(t_s, WRONG, **given)["wrong_s"].to_list() == in_use_s
-    assert used([0.0], WRONG)["wrong_s"].to_list() == [0.0]
+    assert found.used_s.tolist() == in_use_s
+    assert found.in_use.tolist() == [True] * 7 + [False] * 3
+    assert found.counted_s.tolist() == [1.0] * 3 + [1.5] + [1.0] * 6
+    assert used(t_s, WRONG, **given).wrong_s.tolist() == in_use_s
+    assert used([0.0], WRONG).wrong_s.tolist() == [0.0]
 
 
 def test_a_wrong_position_counts_whole_since_the_one_before_it_and_an_unknown_one_too() -> None:
     """At 10 Hz with 0.9 s of nothing: right before it, wrong behind it; then unknown and wrong, 0.9 s later."""
     t_s = [0.0, 0.1, 1.0, 1.1, 2.0, 2.1, 2.2]
     found = used(t_s, [RIGHT, RIGHT, WRONG, WRONG, UNKNOWN, WRONG, WRONG])
-    assert found["wrong_s"].to_numpy() == pytest.approx([0.0, 0.0, 0.9, 0.1, 0.0, 0.1, 0.1])
-    assert found["used_s"].to_numpy() == pytest.approx([0.1, 0.1, 0.9, 0.1, 0.9, 0.1, 0.1])
+    assert found.wrong_s == pytest.approx([0.0, 0.0, 0.9, 0.1, 0.0, 0.1, 0.1])
+    assert found.used_s == pytest.approx([0.1, 0.1, 0.9, 0.1, 0.9, 0.1, 0.1])
 
 
 def test_a_stretch_of_a_slower_log_hides_no_second() -> None:
@@ -457,8 +459,8 @@ def test_a_stretch_of_a_slower_log_hides_no_second() -> None:
     code, size = np.full(203, RIGHT), 203
     code[200:] = WRONG
     found = used(t_s, code.tolist(), negated=[row >= 200 for row in range(size)])
-    assert found["wrong_s"].to_numpy()[199:] == pytest.approx([0.0, 1.0, 1.0, 0.0])
-    assert found["in_use"].to_list()[199:] == [True, True, True, False]
+    assert found.wrong_s[199:] == pytest.approx([0.0, 1.0, 1.0, 0.0])
+    assert found.in_use.tolist()[199:] == [True, True, True, False]
 
 
 @pytest.mark.parametrize(
@@ -484,9 +486,9 @@ def test_only_an_injected_fault_of_gnss_is_not_natures(target: str, end_s: float
 def test_a_withheld_position_is_not_in_use_nor_what_follows_upon_its_alarm() -> None:
     """The bank restarts at 2 s, and fails at once: nothing was in use in its reaction. Back at 5 s."""
     negated = [t in (2, 3, 4) for t in range(7)]
-    found = used(range(7), WRONG, negated=negated, withheld=[t == 2 for t in range(7)])
-    assert found["in_use"].to_list() == [True, True, False, False, False, False, True]
-    assert used(range(7), WRONG, negated=negated)["in_use"].to_list() == [True, True, True, True, False, False, True]
+    found = used(range(7), WRONG, negated=negated, withheld_for=["relink" if t == 2 else None for t in range(7)])
+    assert found.in_use.tolist() == [True, True, False, False, False, False, True]
+    assert used(range(7), WRONG, negated=negated).in_use.tolist() == [True, True, True, True, False, False, True]
 
 
 def test_rows_without_a_position_stand_for_no_time_between_near_positions() -> None:
@@ -494,10 +496,10 @@ def test_rows_without_a_position_stand_for_no_time_between_near_positions() -> N
     t_s = 0.5 * np.arange(15)
     path_m = [1.0 if t in (0.0, 1.0, 2.0, 7.0) else None for t in t_s]
     found = used(t_s, RIGHT, path_m=path_m)
-    positions_s = [time for time in found["used_s"] if time > 0.0]
+    positions_s = [time for time in found.used_s if time > 0.0]
     assert positions_s == pytest.approx([1.0, 1.0, 1.0, 1.5])
-    assert found["used_s"].to_numpy()[np.equal(path_m, None)].sum() == 0.0
-    assert found["counted_s"].sum() == pytest.approx(3 * 1.0 + 10 * 0.5)
+    assert found.used_s[np.equal(path_m, None)].sum() == 0.0
+    assert found.counted_s.sum() == pytest.approx(3 * 1.0 + 10 * 0.5)
 
 
 @pytest.mark.parametrize(
@@ -512,8 +514,8 @@ def test_rows_without_a_position_stand_for_no_time_between_near_positions() -> N
     ],
 )
 def test_the_first_state_that_applies(code: int, in_use: bool, negated: bool, blind: bool, state: str | None) -> None:
-    epochs = pl.DataFrame({"negated": [negated]})
-    assert lds_states(epochs, np.array([code]), np.array([in_use]), np.array([blind])).to_list() == [state]
+    (found,) = lds_states(*(np.array([value]) for value in (negated, code, in_use, blind)))
+    assert found == (-1 if state is None else list(LdsState).index(LdsState(state)))
 
 
 def test_a_train_moves_farther_in_a_second_than_the_noise_of_its_places() -> None:
@@ -522,9 +524,10 @@ def test_a_train_moves_farther_in_a_second_than_the_noise_of_its_places() -> Non
     moves = np.array([True] * 8 + [False] * 2)
     counted = np.array([False] * 6 + [True] * 3 + [False])
     odometer, stood = OdometerSteps(moves, counted), np.arange(10) == 7
-    moved = moving(seconds(*(0.5 * np.arange(10))), at_m, np.full(10, 0.1), odometer, stood, Configuration())
+    moves, may_move = moving(seconds(*(0.5 * np.arange(10))), at_m, np.full(10, 0.1), odometer, stood, Configuration())
     # By the reference up to 1.5 s, as far as it goes; then by the odometer from 3 s on, but for what it stood.
-    assert moved.to_list() == [False, True, True, True, None, None, True, None, False, False]
+    known = [None if may and not moved else bool(moved) for moved, may in zip(moves, may_move, strict=True)]
+    assert known == [False, True, True, True, None, None, True, None, False, False]
 
 
 def along(error_m: Any, half_m: float, kind: Evidence) -> Judgements:
@@ -775,12 +778,10 @@ def test_failure_mode_and_cause_of_a_passage() -> None:
     frame = pl.DataFrame(PASSAGES, schema=names, orient="row").with_columns(
         t_offered=pl.when("offered").then(pl.lit(0)),
         window_close_m=pl.lit(200.0),
-        failure_mode=pl.lit("none"),
-        cause=pl.lit("none"),
     )
-    found = _with_failures(frame)
-    assert found["failure_mode"].to_list() == frame["mode"].to_list()
-    assert found["cause"].to_list() == frame["why"].to_list()
+    modes, causes = failures_of(frame, frame["_inserted"].to_numpy(), frame["_positioned"].to_numpy())
+    assert modes.to_list() == frame["mode"].to_list()
+    assert causes.to_list() == frame["why"].to_list()
 
 
 @pytest.mark.parametrize(
@@ -798,11 +799,10 @@ def test_failure_mode_and_cause_of_a_passage() -> None:
 )
 def test_whether_an_alarm_was_due(error_m: float, half_m: float, evidence: str, monitor: str, verdict: Verdict) -> None:
     """Ten epochs, an alarm at the sixth; the error is that of the fourth, across the track there is none."""
-    epochs = positions(range(10), np.where(np.arange(10) == 3, error_m, 0.0), half_m, evidence=evidence)
-    across = np.nan if evidence != "reference" else 0.0
-    epochs = epochs.with_columns(
-        pl.Series(name, [across] * 10, nan_to_null=True) for name in ("error_cross_m", "error_up_m")
-    ).with_columns(sigma_cross_m=pl.lit(1.0), sigma_up_m=pl.lit(1.0))
+    across = np.full(10, np.nan if evidence != "reference" else 0.0)
+    error = np.where(np.arange(10) == 3, error_m, 0.0)
+    sigmas = {"sigma_cross_m": 1.0, "sigma_up_m": 1.0}
+    epochs = positions(range(10), error, half_m, evidence=evidence, error_cross_m=across, error_up_m=across, **sigmas)
     alarm = AlarmEpisode(5, 5, 5 * NS, 5 * NS, (monitor,), 2.0)
     config = HazardConfig()
     assert verdict_of(alarm, epochs, healthy_across(epochs, config), config) is verdict
@@ -837,20 +837,23 @@ def test_an_alarm_belongs_to_the_fault_that_lasted_or_that_it_showed(
 def test_what_was_offered_and_of_it_what_the_lds_accepted() -> None:
     """Two crossings came to no passage: one before the balise was armed again, one that is no offer at all."""
     rows = [
-        # balise, kind, status, offered, t
-        ("V3", "virtual", "accepted", True, 30),
-        ("V1", "virtual", "accepted", True, 10),
-        ("V2", "virtual", "rejected_window", True, 20),
-        ("P1", "physical", "accepted", True, 11),
-        ("V1", "virtual", None, False, 12),
-        ("V4", "virtual", "missed", False, 40),
-        ("V5", None, "accepted", True, 50),
+        # balise, virtual, status, offered
+        ("V1", True, PassageStatus.ACCEPTED, True),
+        ("P1", False, PassageStatus.ACCEPTED, True),
+        ("V1", True, None, False),
+        ("V2", True, PassageStatus.REJECTED_WINDOW, True),
+        ("V3", True, PassageStatus.ACCEPTED, True),
+        ("V4", True, PassageStatus.MISSED, False),
     ]
-    crossings = pl.DataFrame(rows, schema=["balise_id", "kind", "status", "offered", "t"], orient="row")
+    names, virtual, status, offered = zip(*rows, strict=True)
+    at = np.arange(len(rows))
+    crossings = Crossings(
+        balise_id=names, netelement_id=["n"] * len(rows), measure_m=at * 1.0, leg=at, path_m=at * 1.0,
+        virtual=np.array(virtual), before=at, epoch=at, t_ns=at, offered=np.array(offered),
+        sense=np.ones_like(at), direction=np.ones_like(at), odometer_m=at * 1.0,
+        status=np.array([-1 if one is None else list(PassageStatus).index(one) for one in status]),
+    )  # fmt: skip
     absent: Any = None
     solution = Solution("primary", absent, absent, crossings, absent, absent, absent)
-    assert solution.offers.select("balise_id", "virtual", "accepted").rows() == [
-        ("V3", True, True), ("V1", True, True), ("V2", True, False), ("P1", False, False), ("V1", True, False),
-        ("V5", None, False),
-    ]  # fmt: skip
-    assert solution.accepted["balise_id"].to_list() == ["V1", "V3"]
+    assert [names[row] for row in solution.offers] == ["V1", "P1", "V1", "V2", "V3"]
+    assert [names[row] for row in np.flatnonzero(crossings.accepted)] == ["V1", "V3"]

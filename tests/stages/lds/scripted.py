@@ -2,20 +2,34 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
-from dataclasses import replace
-from typing import Any
+from collections.abc import Iterable, Mapping, Sequence
+from typing import Any, NamedTuple
 
 import numpy as np
 import polars as pl
 
-from pipeline.stages.lds import LdsResult, run_lds
+from pipeline.stages.epochs.verdicts import Verdicts
+from pipeline.stages.lds import run_lds
+from pipeline.stages.lds.link_monitors import Held
 from schemas.config import Configuration, LdsConfig, MonitorConfig
-from schemas.stages import AlignedEpochs
+from schemas.enums import PassageStatus
+from schemas.stages import AlignedEpochs, Crossings
+from tests.arrays_of_table import arrays_of_table
 
 SCALE_SIGMA = 1e-4
 K_T = 5.3267238
 INSTANT = pl.Datetime("ns", "UTC")
+
+
+class LdsTables(NamedTuple):
+    """What the LDS made of a journey, in tables; `epochs` with the verdicts of the linking monitors."""
+
+    epochs: pl.DataFrame
+    crossings: pl.DataFrame
+    passages: pl.DataFrame
+    linking: Mapping[str, Verdicts]
+    unknown_reads: pl.DataFrame
+    held: tuple[Held, ...]
 
 
 class ScriptedBank:
@@ -57,6 +71,9 @@ class ScriptedBank:
 
     def along_evaluated(self, epoch: int) -> bool:
         return epoch > self.started and epoch not in self.blind
+
+    def hidden_until(self, epoch: int, end: int) -> int:
+        return next((k for k in range(epoch, end) if k not in self.unknown or self.failed(k)), end)
 
     def quiet_until(self, epoch: int, end: int) -> int:
         return next((k for k in range(epoch, end) if not self._quiet(k)), end)
@@ -151,13 +168,35 @@ def run(
     scale_sigma: float | None = SCALE_SIGMA,
     disabled: Sequence[str] = (),
     **lds: Any,
-) -> LdsResult:
+) -> LdsTables:
     on_odometer = None if reads is None else with_odometer(reads, epochs)
     bank = (bank or ScriptedBank()).watch(epochs)
     config = settings(disabled, **lds)
-    result = run_lds(AlignedEpochs.of_table(epochs), bank, balises, on_odometer, scale_sigma, config)
+    result = run_lds(arrays_of_table(AlignedEpochs, epochs), bank, balises, on_odometer, scale_sigma, config)
     columns = [column for name, verdicts in result.linking.items() for column in verdicts.columns(name)]
-    return replace(result, epochs=result.epochs.with_columns(columns))
+    return LdsTables(
+        epochs=pl.DataFrame([epochs["t"], *result.epochs.table, *columns]),
+        crossings=_crossings(result.crossings),
+        passages=result.passages,
+        linking=result.linking,
+        unknown_reads=result.unknown_reads,
+        held=result.held,
+    )
+
+
+def _crossings(met: Crossings) -> pl.DataFrame:
+    """One row each; `crossing_id` is its place."""
+    words = [status.value for status in PassageStatus] + [None]
+    return pl.DataFrame(
+        {
+            "crossing_id": np.arange(met.size),
+            "t": pl.Series(met.t_ns, dtype=pl.Int64).cast(INSTANT),
+            "kind": np.where(met.virtual, "virtual", "physical"),
+            "status": pl.Series([words[number] for number in met.status], dtype=pl.String),
+            **{name: getattr(met, name) for name in ("balise_id", "netelement_id", "measure_m", "leg", "path_m")},
+            **{name: getattr(met, name) for name in ("before", "epoch", "sense", "direction", "odometer_m", "offered")},
+        }
+    )
 
 
 def settings(disabled: Sequence[str] = (), **lds: Any) -> Configuration:
@@ -172,14 +211,14 @@ def with_odometer(reads: pl.DataFrame, epochs: pl.DataFrame) -> pl.DataFrame:
     return reads.with_columns(odometer_m=pl.Series(here_m, nan_to_null=True))
 
 
-def negations(result: LdsResult) -> list[tuple[int, int | None]]:
+def negations(result: LdsTables) -> list[tuple[int, int | None]]:
     """First epoch of each negation, and that of the return (none to the end)."""
     negated = np.concatenate([[False], result.epochs["negated"].to_numpy(), [False]])
     begins, ends = np.flatnonzero(np.diff(negated.astype(np.int8))).reshape(-1, 2).T.tolist()
     return [(begin, end if end < result.epochs.height else None) for begin, end in zip(begins, ends, strict=True)]
 
 
-def passage_rows(result: LdsResult, *columns: str) -> list[tuple[Any, ...]]:
+def passage_rows(result: LdsTables, *columns: str) -> list[tuple[Any, ...]]:
     """Passages as tuples of the named columns, times in seconds, enums as text."""
     frame = result.passages.select(columns)
     times = [i for i, kind in enumerate(frame.dtypes) if kind == INSTANT]

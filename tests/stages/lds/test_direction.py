@@ -9,9 +9,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from pipeline.stages.lds import LdsResult
 from schemas.enums import Direction
-from tests.stages.lds.scripted import ScriptedBank, balises_at, epochs_of, passage_rows, run, steps
+from tests.stages.lds.scripted import LdsTables, ScriptedBank, balises_at, epochs_of, passage_rows, run, steps
 from tests.stages.lds.test_invariants import Chaos
 
 AHEAD, BACK, BOTH = 1, -1, 0
@@ -25,7 +24,7 @@ def shuttle() -> list[float]:
     return [*ahead, *[1000.0] * 10, *steps(980.0, -20.0, 50)]
 
 
-def names(result: LdsResult, direction: Direction) -> list[str]:
+def names(result: LdsTables, direction: Direction) -> list[str]:
     return [name for name, way, *_ in passage_rows(result, *COLUMNS) if way == direction.value]
 
 

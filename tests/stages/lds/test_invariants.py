@@ -11,10 +11,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from pipeline.stages.lds import LdsResult
 from pipeline.stages.lds.machine import LocationSystem
 from pipeline.stages.odometry.bound import LOST_M
-from tests.stages.lds.scripted import ScriptedBank, balises_at, epochs_of, reads_at, run
+from tests.stages.lds.scripted import LdsTables, ScriptedBank, balises_at, epochs_of, reads_at, run
 
 _NOT_OFFERED = ("missed", "not_available")
 
@@ -50,7 +49,7 @@ class Chaos:
         self.linked = [dice.random() < 0.9 for _ in self.places]
         self.reads = sorted((dice.uniform(0.0, size), f"P{dice.randrange(5):02d}") for _ in range(10))
 
-    def replayed(self, shift_s: int = 0) -> LdsResult:
+    def replayed(self, shift_s: int = 0) -> LdsTables:
         later = pl.col("t") + pl.duration(seconds=shift_s)
         epochs = epochs_of(self.path_m, self.odometer_m, doubt_m=self.doubt_m[: len(self.path_m)]).with_columns(later)
         balises = balises_at(self.places, kind=self.kinds, linked=self.linked)

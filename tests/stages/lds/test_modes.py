@@ -12,15 +12,14 @@ from typing import Any
 import polars as pl
 import pytest
 
-from pipeline.stages.lds import LdsResult
 from schemas.tables import Epochs, Passages
-from tests.stages.lds.scripted import K_T, ScriptedBank, balises_at, epochs_of, passage_rows, run, steps
+from tests.stages.lds.scripted import K_T, LdsTables, ScriptedBank, balises_at, epochs_of, passage_rows, run, steps
 
 FAR = {"V9": 1e6}
 V1 = {"V1": 110.0}
 
 
-def changes(result: LdsResult, column: str) -> list[tuple[int, object]]:
+def changes(result: LdsTables, column: str) -> list[tuple[int, object]]:
     """Epochs at which a column takes a new value."""
     values = result.epochs[column].to_list()
     return [(0, values[0])] + [(k + 1, b) for k, (a, b) in enumerate(pairwise(values)) if a != b]

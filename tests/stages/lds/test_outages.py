@@ -22,30 +22,33 @@ def tunnel(seed: int, gap_s: int, offset_m: float) -> Journey:
     return journey(np.random.default_rng(seed), np.arange(float(fault_m.size)), fault_m, 1.0 + seed % 2)
 
 
-def accepted_after(lds: LdsResult) -> int:
-    since_s = (pl.col("t_offered") - lds.epochs["t"][0]).dt.total_seconds()
+def accepted_after(made: Journey, lds: LdsResult) -> int:
+    since_s = (pl.col("t_offered") - made.run.gnss["t"][0]).dt.total_seconds()
     return lds.passages.filter(pl.col("status") == "accepted", since_s >= LOST_S).height
 
 
 @pytest.mark.parametrize("gap_s", [5, 40, 90, 300])
 @pytest.mark.parametrize("seed", [1, 2, 3])
 def test_an_offset_that_comes_out_of_an_outage_is_never_accepted(seed: int, gap_s: int) -> None:
-    _, healthy = lds_of(tunnel(seed, gap_s, 0.0), CONFIG)
-    assert accepted_after(healthy) >= 5
-    assert not healthy.epochs["alarm"].any()
+    made = tunnel(seed, gap_s, 0.0)
+    _, healthy = lds_of(made, CONFIG)
+    assert accepted_after(made, healthy) >= 5
+    assert not healthy.epochs.alarm.any()
     for offset_m in (30.0, -30.0):
-        _, off = lds_of(tunnel(seed, gap_s, offset_m), CONFIG)
-        assert accepted_after(off) == 0
-        assert off.epochs["alarm"][LOST_S]
+        made = tunnel(seed, gap_s, offset_m)
+        _, off = lds_of(made, CONFIG)
+        assert accepted_after(made, off) == 0
+        assert off.epochs.alarm[LOST_S]
 
 
 @pytest.mark.parametrize("gap_s", [40, 90])
 def test_without_a_vehicle_file_a_long_outage_ends_the_use_of_the_position(gap_s: int) -> None:
     for offset_m in (0.0, 30.0):
-        _, lds = lds_of(tunnel(4, gap_s, offset_m), CONFIG, Vehicle())
+        made = tunnel(4, gap_s, offset_m)
+        _, lds = lds_of(made, CONFIG, Vehicle())
         used = gap_s == 40 and offset_m == 0.0
-        assert (accepted_after(lds) > 0) == used
-        assert (lds.epochs["negated"][-1] or lds.epochs["withheld"][-1]) is not used
+        assert (accepted_after(made, lds) > 0) == used
+        assert (lds.epochs.negated[-1] or lds.epochs.withheld[-1]) is not used
 
 
 def test_slow_drifts_after_a_return() -> None:
@@ -75,5 +78,5 @@ def test_a_drift_found_in_time_does_not_come_back(rate_mps: float) -> None:
     made = journey(np.random.default_rng(5), np.arange(1_800.0), drift_m, 1.0)
     aligned, lds = lds_of(made, CONFIG)
     error_m = np.abs(aligned.path_m - made.true_m)
-    assert lds.epochs["negated"].any()
-    assert error_m[~lds.epochs["negated"].to_numpy()].max() < 20.0
+    assert lds.epochs.negated.any()
+    assert error_m[~lds.epochs.negated].max() < 20.0

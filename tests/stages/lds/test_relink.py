@@ -8,15 +8,16 @@ from typing import Any
 
 import pytest
 
-from pipeline.stages.lds import LdsResult
 from pipeline.stages.lds.crossings import Journey, balises_of, reads_of
 from pipeline.stages.lds.link_monitors import Relink
 from pipeline.stages.odometry.bound import LOST_M
 from schemas.enums import BaliseKind, NotEvaluated
 from schemas.stages import AlignedEpochs
+from tests.arrays_of_table import arrays_of_table
 from tests.stages.lds.scripted import (
     K_T,
     SCALE_SIGMA,
+    LdsTables,
     ScriptedBank,
     balises_at,
     epochs_of,
@@ -37,7 +38,7 @@ def relink_of(offsets_m: list[float], tvb: list[int], **columns: Any) -> tuple[R
     """Ten epochs whose position is `offsets_m` ahead of the odometer; `tvb`: epochs that are TVBs."""
     odometer_m = steps(0.0, 20.0, 10)
     path_m = [x + offset_m for x, offset_m in zip(odometer_m, offsets_m, strict=True)]
-    journey = Journey(AlignedEpochs.of_table(epochs_of(path_m, odometer_m, **columns)), SCALE_SIGMA, settings())
+    journey = Journey(arrays_of_table(AlignedEpochs, epochs_of(path_m, odometer_m, **columns)), SCALE_SIGMA, settings())
     return Relink(journey, [k in tvb for k in range(10)], settings()), journey
 
 
@@ -238,7 +239,7 @@ def test_a_telegram_renews_what_a_position_is_held_to_after_a_return(ahead_m: fl
 BEFORE = 21  # epochs 0 to 20 s
 
 
-def outage(gap_s: float, offset_m: float, **settings: Any) -> LdsResult:
+def outage(gap_s: float, offset_m: float, **settings: Any) -> LdsTables:
     """No epochs for `gap_s` after 20 s; from its end on the position is off, and the bank has begun anew."""
     t_s = [*map(float, range(BEFORE)), *(20.0 + gap_s + k for k in range(60))]
     odometer_m = [20.0 * t for t in t_s]

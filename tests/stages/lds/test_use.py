@@ -11,15 +11,14 @@ from typing import Any
 
 import pytest
 
-from pipeline.stages.lds import LdsResult
 from pipeline.stages.odometry.bound import LOST_M
-from tests.stages.lds.scripted import ScriptedBank, balises_at, epochs_of, run, steps
+from tests.stages.lds.scripted import LdsTables, ScriptedBank, balises_at, epochs_of, run, steps
 
 COUNT = 120
 IN_USE, NEGATED = "in use", "negated"
 
 
-def changes(result: LdsResult) -> list[tuple[int, str]]:
+def changes(result: LdsTables) -> list[tuple[int, str]]:
     """Epochs at which the use of the position changes, and to what."""
     rows = result.epochs.select("negated", "withheld_for").rows()
     use = [NEGATED if negated else withheld or IN_USE for negated, withheld in rows]
@@ -28,7 +27,7 @@ def changes(result: LdsResult) -> list[tuple[int, str]]:
 
 def walk(
     bank: dict[str, Any], offset_m: float = 0.0, slip: range = range(0), silent: range = range(0), **lds: Any
-) -> LdsResult:
+) -> LdsTables:
     """The position is off by `offset_m` from 25 s on; the odometer slips, or is silent and loses its distance."""
     slips = [k in slip for k in range(COUNT)]
     true_m = steps(0.0, 20.0, COUNT)

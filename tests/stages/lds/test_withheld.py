@@ -10,8 +10,17 @@ from typing import Any
 
 import pytest
 
-from pipeline.stages.lds import LdsResult
-from tests.stages.lds.scripted import ScriptedBank, balises_at, epochs_of, negations, passage_rows, reads_at, run, steps
+from tests.stages.lds.scripted import (
+    LdsTables,
+    ScriptedBank,
+    balises_at,
+    epochs_of,
+    negations,
+    passage_rows,
+    reads_at,
+    run,
+    steps,
+)
 from tests.stages.lds.test_modes import changes
 
 BEGIN, END = 20, 30  # slip from 20 s on, up to 30 s
@@ -20,7 +29,7 @@ V = {"V1": 110.0, "V2": 490.0, "V3": 1410.0}
 
 def slipping(
     offset_m: float, doubt_m: float = 5.0, slipped_m: float = 0.0, later: dict[int, float] | None = None, **given: Any
-) -> LdsResult:
+) -> LdsTables:
     """Slip from 20 to 30 s, in which the odometer counts `slipped_m` too much and is in doubt by `doubt_m`.
 
     The position is off by `offset_m` from 25 s on; `later`: off by so much from these epochs on.

@@ -10,11 +10,13 @@ import polars as pl
 import pytest
 
 from pipeline.stages.epochs.verdicts import DISABLED, NO_ODOMETER, NO_POSITION, NO_VALUE, first_reason, verdicts
-from pipeline.stages.monitors.bank import FIRST_EPOCH, NO_HEIGHT, OFF_TRACK, MonitorBank
+from pipeline.stages.monitors.axes import NO_HEIGHT, OFF_TRACK
+from pipeline.stages.monitors.bank import FIRST_EPOCH, MonitorBank
 from pipeline.stages.monitors.single import NO_VELOCITY, channel_monitor, doppler_monitor, paired
 from schemas.config import Configuration, Vehicle, threshold_factor
 from schemas.stages import AlignedEpochs
 from schemas.tables import BANK_MONITORS
+from tests.arrays_of_table import arrays_of_table
 from tests.frames import bank_over, verdict_table
 from tests.stages.alignment.straight import NO_NOISE, Straight, align_run, epochs_of, odometer_of, run
 
@@ -173,7 +175,9 @@ def test_a_switched_off_monitor_says_so_and_raises_no_alarm():
     path = epochs["path_m"].to_numpy().copy()
     path[2:] += 4.0
     aligned = align_run(epochs.with_columns(path_m=pl.Series(path)), odometer, KNOWN, config)
-    bank = bank_over(aligned, {"along_doppler": doppler_monitor(AlignedEpochs.of_table(aligned), config)}, config)
+    bank = bank_over(
+        aligned, {"along_doppler": doppler_monitor(arrays_of_table(AlignedEpochs, aligned), config)}, config
+    )
     result = table(bank)
     assert result["along_raw_reason"].unique().to_list() == [DISABLED]
     assert result["along_doppler_reason"].unique().to_list() == [DISABLED]
@@ -191,13 +195,13 @@ def test_doppler_sides_with_gnss_when_the_wheels_slip():
     slip = 5.0 * np.clip(odometer_t - 10.0, 0.0, 1.0)
     epochs = epochs_of(t, 20.0 * t, velocity_along_mps=np.full(t.size, 20.0))
     aligned = align_run(epochs, odometer_of(odometer_t, 20.0 * odometer_t + slip), KNOWN, CONFIG)
-    result = verdict_table(doppler_monitor(AlignedEpochs.of_table(aligned), CONFIG))
+    result = verdict_table(doppler_monitor(arrays_of_table(AlignedEpochs, aligned), CONFIG))
     fails = [t[k] for k in range(t.size) if result["state"][k] == "fail"]
     assert 10.0 < fails[0] < 10.5
     assert fails[-1] < 12.1
     assert result["value"][120] == pytest.approx(-1.0, abs=4.1)
     without = align_run(epochs_of(t, 20.0 * t), odometer_of(odometer_t, 20.0 * odometer_t), KNOWN, CONFIG)
-    without = verdict_table(doppler_monitor(AlignedEpochs.of_table(without), CONFIG))
+    without = verdict_table(doppler_monitor(arrays_of_table(AlignedEpochs, without), CONFIG))
     assert without["reason"].unique().to_list() == [NO_VELOCITY]
 
 

@@ -20,6 +20,7 @@ from pipeline.stages.monitors.pseudorange import (
 )
 from schemas.config import Configuration, MonitorConfig
 from schemas.stages import MatchedEpochs
+from tests.arrays_of_table import arrays_of_table
 from tests.frames import verdict_table
 
 T0 = datetime(2024, 3, 20, 6, 27, tzinfo=UTC)
@@ -28,7 +29,7 @@ SKY = visible(GPS + GALILEO, np.array([int(T0.timestamp()) * 1_000_000_000]), 50
 
 
 def monitored(epochs, satellites, config):
-    return verdict_table(pseudorange_monitor(MatchedEpochs.of_table(epochs), satellites, config))
+    return verdict_table(pseudorange_monitor(arrays_of_table(MatchedEpochs, epochs), satellites, config))
 
 
 def epochs_of(count: int, **columns: object) -> pl.DataFrame:

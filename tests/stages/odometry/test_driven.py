@@ -6,7 +6,7 @@ import numpy as np
 import polars as pl
 import pytest
 
-from pipeline.stages.odometry.driven import evenly_driven, travelled_m, under_way, with_hysteresis
+from pipeline.stages.odometry.driven import evenly_driven, is_moving, travelled_m, with_hysteresis
 from schemas.config import AlignConfig, Configuration
 from tests.replay.journeys import VEHICLE, journey, replay
 from tests.stages.alignment.straight import NO_NOISE
@@ -50,7 +50,7 @@ def test_rows_that_scatter_at_a_stand_are_not_under_way():
     t_s = np.arange(0.0, 40.0, 0.2)
     rows_m = 5.0 * np.maximum(t_s - 20.0, 0.0) + np.random.default_rng(1).normal(0.0, 0.5, t_s.size)
     way_m = travelled_m(t_s, rows_m, np.full(t_s.size, 2.5), 0.3, 1.0)
-    moving = under_way(t_s, way_m, 0.3, 1.0)
+    moving = is_moving(t_s, way_m, 0.3, 1.0)
     assert not moving[t_s < 20.0].any()
     assert moving[t_s > 21.5].mean() > 0.9
 

@@ -306,7 +306,7 @@ def test_what_is_known_of_the_rows_does_not_depend_on_later_ones(kind, size, rat
         assert cut.t_s.size <= whole.t_s.size
         at_s = t[: rows - 4] - t[0]
         found, expected = cut.noise_at_s(at_s), whole.noise_at_s(at_s)
-        for name in ("white_m2_per_s", "still_m2", "moving_s2", "faster_s2", "seen_mps", "period_s", "shown"):
+        for name in ("white_m2_per_s", "still_m2", "moving_s2", "faster_s2", "shown_mps", "period_s", "shown"):
             np.testing.assert_array_equal(getattr(found, name), getattr(expected, name), err_msg=name)
         at_ns = whole.epoch_ns + np.round(1e9 * at_s).astype(np.int64)
         np.testing.assert_array_equal(cut.travelled_at(at_ns)[:-20], whole.travelled_at(at_ns)[:-20])

@@ -7,7 +7,7 @@ from statistics import NormalDist
 import numpy as np
 import pytest
 
-from pipeline.stages.paths.path_tests import _limits_beside
+from pipeline.stages.paths.path_tests import _limits_by_spacing
 from schemas.arrays import Floats, floats
 from tests.stages.matching.builders import line, matched, odometer, run, site
 
@@ -56,7 +56,7 @@ def test_a_single_line_is_left_at_the_limit_of_its_offset() -> None:
 @pytest.mark.parametrize("apart", [0.5, 1.0, 1.5, 2.0, 2.5, 3.0, 4.0])
 def test_of_claims_by_offset_no_more_are_wrong_than_they_say(apart: float) -> None:
     """Two tracks so many roots apart, drawn offsets; of a million runs less than twenty need not be looked at."""
-    (limit,) = _limits_beside(np.array([apart]), 0.05, 3.0)
+    (limit,) = _limits_by_spacing(np.array([apart]), 0.05, 3.0)
     tail = NormalDist().cdf
     right, wrong = tail(apart - limit), tail(-limit)
     assert wrong <= 0.01 * right or wrong < 2e-5

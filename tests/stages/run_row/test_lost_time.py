@@ -7,11 +7,12 @@ from typing import Any
 import polars as pl
 import pytest
 
+from pipeline.stages.judge.judged import JudgedEpochs
 from pipeline.stages.run_row.lost_time import InUse, LostTime, in_use_of, lost_columns, lost_time, remedies
 from schemas.config import Configuration
 from schemas.enums import LostTo, Remedy
-from schemas.stages import EpochFigures
 from schemas.words import remedy_words
+from tests.arrays_of_table import arrays_of_table
 from tests.tables import NS, alarms, epochs
 
 CONFIG = Configuration()
@@ -20,7 +21,7 @@ NO_ALARMS = alarms()
 
 
 def lost(t_s: list[float] = TEN_S, found: Any = NO_ALARMS, **columns: Any) -> LostTime:
-    judged = EpochFigures.of_table(epochs(t_s, **columns))
+    judged = arrays_of_table(JudgedEpochs, epochs(t_s, **columns))
     return lost_time(judged, lost_columns(judged, CONFIG), found, CONFIG)
 
 
@@ -208,7 +209,7 @@ def test_where_the_unknown_lies() -> None:
     word = {True: "right", False: "unknown"}
 
     def parts(known: list[bool], **columns: Any) -> InUse:
-        judged = EpochFigures.of_table(epochs(TEN_S, judgement=[word[k] for k in known], **columns))
+        judged = arrays_of_table(JudgedEpochs, epochs(TEN_S, judgement=[word[k] for k in known], **columns))
         return in_use_of(judged, float(lost_columns(judged, CONFIG).moving_s.sum()))
 
     ends = [False, False, True, True, True, True, True, True, True, False]
@@ -223,7 +224,7 @@ def test_the_epochs_say_what_each_was_lost_to() -> None:
     t_s = [0.0, 1.0, 2.0, 3.0, 4.0, 24.0, 25.0, 26.0]
     moving = [True, False, True, True, True, True, None, True]
     frame = epochs(t_s, moving=moving, tvb=[k != 3 for k in range(8)], confidence_m=[5.0, 5.0, 5.0, 50.0, *[5.0] * 4])
-    found = pl.DataFrame(lost_columns(EpochFigures.of_table(frame), CONFIG).columns())
+    found = pl.DataFrame(lost_columns(arrays_of_table(JudgedEpochs, frame), CONFIG).columns())
     assert found["step_s"].to_list() == [1.0, 1.0, 1.0, 1.0, 20.0, 1.0, 1.0, 0.0]
     assert found["gap"].to_list() == [False, False, False, False, True, False, False, False]
     assert found["moving_s"].to_list() == [1.0, 0.0, 1.0, 1.0, 20.0, 1.0, 1.0, 0.0]

@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from scipy import stats
 
 from pipeline.stages.run_row.bounds import (
     UNKNOWN,
@@ -36,6 +35,8 @@ def test_two_sided_poisson_bounds_as_in_printed_tables(events: int, low: float, 
 
 @given(st.integers(0, 500), st.floats(1e-3, 1e6), st.floats(0.5, 0.999))
 def test_poisson_bounds_are_chi_square_quantiles(events: int, hours: float, confidence: float) -> None:
+    from scipy import stats  # takes long to load, in each of the test processes
+
     tail = (1 - confidence) / 2
     estimate = poisson_rate(events, hours, confidence)
     low = stats.chi2.ppf(tail, 2 * events) / 2 / hours if events else 0.0
@@ -46,6 +47,8 @@ def test_poisson_bounds_are_chi_square_quantiles(events: int, hours: float, conf
 
 @given(st.integers(0, 300), st.integers(0, 300), st.floats(0.5, 0.999))
 def test_clopper_pearson_bounds_are_those_of_scipy(successes: int, failures: int, confidence: float) -> None:
+    from scipy import stats  # takes long to load, in each of the test processes
+
     trials = successes + failures
     estimate = clopper_pearson(successes, trials, confidence)
     if trials == 0:
@@ -121,6 +124,8 @@ def test_clopper_pearson_covers_the_truth(share: float, trials: int, ceiling: fl
 @pytest.mark.parametrize("mean", np.geomspace(0.05, 80.0, 40))
 def test_poisson_coverage_is_never_below_what_it_claims(mean: float) -> None:
     """Without chance: the probability of all counts whose bounds hold the truth."""
+    from scipy import stats  # takes long to load, in each of the test processes
+
     counts = np.arange(400)
     holds = [e.low <= mean <= e.high for e in (poisson_rate(int(k), 1.0) for k in counts)]
     assert stats.poisson.pmf(counts, mean)[holds].sum() >= 0.95 - 1e-12

@@ -5,21 +5,23 @@ from dataclasses import replace
 from functools import lru_cache
 from typing import Any
 
+import numpy as np
 import polars as pl
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from pipeline.stages.judge.judge import Judged
+from pipeline.stages.judge.judged import JudgedEpochs
 from pipeline.stages.provenance import Provenance
 from pipeline.stages.run_row.lost_time import lost_columns
 from pipeline.stages.run_row.summary import SolutionResults, failed_row, summarise
 from schemas.config import Configuration, LdsConfig
 from schemas.enums import Evidence, Note, VehicleFigures
 from schemas.run import IngestNotes
-from schemas.stages import EpochFigures
 from schemas.tables import CONTRACT_VERSION, SCALES, Runs
 from schemas.words import Remark
+from tests.arrays_of_table import arrays_of_table
 from tests.tables import NS, alarms, epochs, failures, hazards, passages
 
 COLUMNS: dict[str, Any] = {
@@ -34,13 +36,16 @@ _TIMES_S = [0.0, 1.0, 2.0, 6.0, 7.0, 8.0]
 
 
 def results(frame: pl.DataFrame, **fields: Any) -> SolutionResults:
-    nothing = Judged(hazards(), alarms(), passages(), failures(), frame, pl.DataFrame(), None, Evidence.REFERENCE)
+    epochs = arrays_of_table(JudgedEpochs, frame)
+    absent: Any = None
+    suspect = np.zeros(epochs.height, dtype=np.bool_)
+    tables = hazards(), alarms(), passages()
+    nothing = Judged(*tables, failures(), epochs, absent, suspect, None, Evidence.REFERENCE)
     given = {name: fields.pop(name) for name in vars(nothing) if name in fields}
     own = {name: fields.pop(name) for name in ("ingest", "notes") if name in fields}
-    judged = EpochFigures.of_table(frame)
-    return SolutionResults(
-        "primary", judged, lost_columns(judged, CONFIG), replace(nothing, **given), COLUMNS | fields, **own
-    )
+    lost = lost_columns(epochs, CONFIG)
+    undetected = frame.select(pl.col("^undetected_.*$"))
+    return SolutionResults("primary", lost, replace(nothing, **given), undetected, COLUMNS | fields, **own)
 
 
 def row(frame: pl.DataFrame, config: Configuration = CONFIG, **fields: Any) -> dict[str, Any]:

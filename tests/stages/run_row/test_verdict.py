@@ -9,6 +9,7 @@ import pytest
 from pipeline.results.figures.head import head_of, run_verdicts, worst_verdict
 from pipeline.stages.run_row.bounds import independent_episodes, missed_detection
 from pipeline.stages.run_row.run_figures import reasons_of, verdict_of
+from schemas.config import HazardConfig
 from schemas.enums import Reason, RunVerdict
 from schemas.tables import Runs
 from schemas.words import part_words, reason_words
@@ -38,7 +39,7 @@ def failed(spent_s: float, may_s: float, accepted: str = "right") -> dict[str, A
 
 
 def reasons(found: dict[str, Any]) -> list[str]:
-    return [reason.value for reason in reasons_of(CLEAN | found, BUDGET_S, 0.01)]
+    return [reason.value for reason in reasons_of(CLEAN | found, BUDGET_S, HazardConfig())]
 
 
 @pytest.mark.parametrize(

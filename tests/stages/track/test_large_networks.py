@@ -9,7 +9,7 @@ import pytest
 from pipeline.stages.paths.candidates import candidates_of, search_about, segments_of
 from pipeline.stages.track.chords import _straightest, _wrapped
 from pipeline.stages.track.geodesy import distances_m, points_of
-from pipeline.stages.track.network import _ways, connected_parts, network_of
+from pipeline.stages.track.network import _onward, connected_parts, network_of
 from pipeline.stages.track.segments import Polyline
 from pipeline.stages.track.survey import SurveyedTrack, track_of
 from schemas.conform import conform
@@ -42,7 +42,7 @@ def test_ways_keep_their_order_and_a_repeated_one_allows_what_either_does(seed: 
     here, there = rng.integers(0, 6, (2, 20))
     forward, backward = rng.integers(0, 2, (2, 20)).astype(np.bool_)
     gap_m = (here * 10 + there).astype(np.float64)
-    ways = _ways(6, here, there, gap_m, forward, backward)
+    ways = _onward(6, here, there, gap_m, forward, backward)
     for start in range(6):
         rows = np.flatnonzero(here == start)
         expected = {}

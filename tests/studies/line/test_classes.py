@@ -130,7 +130,7 @@ def test_what_the_reference_lost_counts_against_a_piece(site: Site) -> None:
     assert found["loss_high"] == pytest.approx(0.2167, abs=1e-4)
     assert found["loss_low"] == 0.0
     # Where the evidence is of reads they are no trials.
-    unseen = many.with_columns(pl.col("state").replace(int(SpanState.UNKNOWN), int(SpanState.UNSEEN)))
+    unseen = many.with_columns(pl.col("state").replace(int(SpanState.UNKNOWN), int(SpanState.NOT_COVERED)))
     assert classes(unseen, site).row(by_predicate=place, named=True)["word"] == "suitable"
 
 

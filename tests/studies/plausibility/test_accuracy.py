@@ -8,9 +8,11 @@ import numpy as np
 import polars as pl
 import pytest
 
+from pipeline.stages.judge.judged import JudgedEpochs
 from pipeline.studies.plausibility.report import accuracy_checks, refuted
 from schemas.config import Configuration
 from schemas.enums import MisfitCause
+from tests.arrays_of_table import arrays_of_table
 
 CONFIG = Configuration()
 BEGIN = datetime(2025, 3, 3, tzinfo=UTC)
@@ -18,10 +20,10 @@ BEGIN = datetime(2025, 3, 3, tzinfo=UTC)
 
 def epochs_of(
     error_m: np.ndarray, stated_m: float, half_m: float = 0.05, hpl_m: float | None = None, negated: bool = False
-) -> pl.DataFrame:
+) -> JudgedEpochs:
     count = error_m.size
     times = pl.Series([BEGIN + timedelta(seconds=second) for second in range(count)], dtype=pl.Datetime("ns", "UTC"))
-    return pl.DataFrame(
+    table = pl.DataFrame(
         {
             "t": times,
             "sigma_along_m": np.full(count, stated_m),
@@ -32,6 +34,7 @@ def epochs_of(
             "negated": [negated] * count,
         }
     )
+    return arrays_of_table(JudgedEpochs, table)
 
 
 def found(*args: object, **more: object) -> set[tuple[MisfitCause, str]]:

@@ -138,7 +138,7 @@ def watched(window: Rows) -> Watched:
         fresh=window.fresh,
         free=np.zeros(size, dtype=bool),
         fastest_m=window.largest_mps * window.dt_s,
-        way_s=window.dt_s,
+        gain_s=window.dt_s,
         rate_mps=window.rate_mps,
         least_mps=np.maximum(-window.raw_mps * unseen, window.rate_mps - window.largest_mps),
         most_mps=np.minimum(window.raw_mps * unseen, window.rate_mps + window.largest_mps),

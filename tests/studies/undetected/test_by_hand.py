@@ -50,7 +50,7 @@ def test_balises_may_be_as_far_apart_as_the_error_stays_within_the_limit(
 
     monkeypatch.setattr(spacing, "_first_beyond", counted)
     found, _ = largest_spacing(watched(constant(10, 0.01, 0.02)), WAY_M, settings(limit_m))
-    assert found.way_m == (None if spacing_m is None else pytest.approx(spacing_m))
+    assert found.distance_m == (None if spacing_m is None else pytest.approx(spacing_m))
     # 0 m cannot become less: only the first starts are tried.
     assert starts is None or len(searched) == starts
 
@@ -68,7 +68,7 @@ def test_balises_may_be_as_far_apart_as_the_error_stays_within_the_limit(
 )
 def test_starts_lie_no_nearer_than_the_resolution(resolution_s: float, spacing_m: float) -> None:
     found, _ = largest_spacing(watched(constant(10, 0.01, 0.02)), WAY_M, settings(0.525, resolution_s))
-    assert found.way_m == pytest.approx(spacing_m)
+    assert found.distance_m == pytest.approx(spacing_m)
 
 
 def test_relinks_bound_the_fault_by_what_they_measured() -> None:

@@ -2,11 +2,17 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import polars as pl
 import pytest
 
 from pipeline.results.figures.undetected import spacing_of_runs, undetected_spread
+from pipeline.stages.judge.judged import JudgedEpochs
+from pipeline.studies.undetected.columns import Undetected
 from pipeline.studies.undetected.figures import Spacing, undetected_figures
+from schemas.config import Configuration
+from tests.arrays_of_table import arrays_of_table
 from tests.tables import epochs, passages
 
 
@@ -18,7 +24,7 @@ def test_of_a_run_only_what_was_in_use() -> None:
         undetected_behind_m=behind,
         in_use=[True, True, True, False, True],
     )
-    found = undetected_figures(used, Spacing(900.0, 30.0, 7, 2), 20.0)
+    found = undetected_figures(arrays_of_table(JudgedEpochs, used), used, Spacing(900.0, 30.0, 7, 2), 20.0)
     assert found == {
         "physical_spacing_m": 900.0,
         "physical_spacing_s": 30.0,
@@ -31,7 +37,8 @@ def test_of_a_run_only_what_was_in_use() -> None:
         "t_undetected_beyond": 2_000_000_000,
         "undetected_beyond_path_m": 40.0,
     }
-    assert undetected_figures(used, None, 20.0) == {}
+    nothing: Any = None
+    assert Undetected(used, nothing).figures(arrays_of_table(JudgedEpochs, used), Configuration()) == {}
 
 
 def test_of_a_balise_the_larger_of_both_directions() -> None:

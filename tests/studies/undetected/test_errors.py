@@ -143,13 +143,13 @@ def test_starts_that_were_not_tried_leave_no_shorter_spacing() -> None:
             # From here on a balise at the start was too far before.
             assert (before_m[start + 1 + beyond :] < way_m[start + 1 + beyond :] - way_m[start] + 1e-9).all()
     assert min(ways) > 100.0
-    assert found.way_m is not None
-    assert 0.9 * min(ways) - 1e-9 <= found.way_m <= min(ways) + 1e-9
-    assert found.time_s == pytest.approx(found.way_m / 10.0, abs=1e-9)
+    assert found.distance_m is not None
+    assert 0.9 * min(ways) - 1e-9 <= found.distance_m <= min(ways) + 1e-9
+    assert found.time_s == pytest.approx(found.distance_m / 10.0, abs=1e-9)
     settings["undetected"]["spacing_close_share"] = 0.999
     coarse, _ = largest_spacing(seen, way_m, Configuration.model_validate(settings))
-    assert coarse.way_m is not None
-    assert coarse.way_m < 0.9 * min(ways)
+    assert coarse.distance_m is not None
+    assert coarse.distance_m < 0.9 * min(ways)
 
 
 def test_any_split_bounds_the_growth() -> None:

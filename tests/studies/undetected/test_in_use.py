@@ -36,7 +36,7 @@ def rows() -> Watched:
         fresh=np.arange(ROWS) == 0,
         free=zero > 0,
         fastest_m=zero + 5.0,
-        way_s=zero + 1.0,
+        gain_s=zero + 1.0,
         rate_mps=zero,
         least_mps=zero - 1.0,
         most_mps=zero + 1.0,

@@ -1,11 +1,11 @@
-"""A plot of lines with bands as SVG: axes, ticks, curves, key; the same content gives the same bytes."""
+"""Plots of lines with bands, and strips of coloured pieces, as SVG; the same content gives the same bytes."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import field
 from html import escape
-from math import isfinite, log10
+from math import ceil, floor, isfinite, log10
 
 from schemas.frozen import frozen
 
@@ -53,6 +53,13 @@ class Curve:
     dashed: bool = False
     band: Sequence[Point] = ()
     marks: Sequence[Point] = field(default=())
+
+
+def even_ticks(low: float, high: float) -> list[float]:
+    """At most ten multiples of 1, 2 or 5 times a power of ten from `low` to `high`."""
+    power = 10.0 ** floor(log10((high - low) / 10.0))
+    step = next(power * factor for factor in (1.0, 2.0, 5.0, 10.0) if (high - low) / (power * factor) <= 10.0)
+    return [step * number for number in range(ceil(low / step), floor(high / step) + 1)]
 
 
 def plot(title: str, x: Axis, y: Axis, curves: Sequence[Curve]) -> str:
@@ -135,4 +142,57 @@ def _key(curves: Sequence[Curve]) -> list[str]:
             f'<line x1="{left}" y1="{at}" x2="{left + 24}" y2="{at}" stroke="{curve.colour}" stroke-width="2"{dash}/>'
         )
         parts.append(text(_RIGHT + 40, at + 4, curve.name))
+    return parts
+
+
+_STRIP_LEFT, _STRIP_WIDTH = 150.0, 730.0
+_LANE = 20.0
+# From little to much.
+_SHADES = ("#e8eef5", "#b9cfe6", "#f3d9a4", "#e79a5b", "#c0392b")
+
+
+@frozen
+class Piece:
+    """From here to there on its strip [m], with a value for each lane, None where not known, and words to show."""
+
+    begin_m: float
+    end_m: float
+    values: tuple[float | None, ...]
+    words: str
+
+
+def strips(title: str, rows: Mapping[str, Sequence[Piece]], scales: Mapping[str, Sequence[float]]) -> str:
+    """A strip for each of the named rows of pieces, in order; a lane for each scale: its limits between five shades."""
+    longest_m = max(row[-1].end_m - row[0].begin_m for row in rows.values())
+    parts = []
+    top = 8.0
+    for name, row in rows.items():
+        begin_m = row[0].begin_m
+        parts.append(text(8.0, top + 24.0, f"{name} from {begin_m:.0f} m"))
+        for piece in row:
+            left = _STRIP_LEFT + (piece.begin_m - begin_m) / longest_m * _STRIP_WIDTH
+            width = (piece.end_m - piece.begin_m) / longest_m * _STRIP_WIDTH - 0.6
+            for lane, (value, limits) in enumerate(zip(piece.values, scales.values(), strict=True)):
+                parts.append(_block(left, top + lane * _LANE, width, value, limits, piece.words))
+        top += len(scales) * _LANE + 10.0
+    for number, (what, limits) in enumerate(scales.items()):
+        parts += _shades(top + 8.0 + 18.0 * number, what, limits)
+    return svg(title, top + 8.0 + 18.0 * len(scales), parts)
+
+
+def _block(left: float, top: float, width: float, value: float | None, limits: Sequence[float], words: str) -> str:
+    colour = "#ffffff" if value is None else _SHADES[sum(value > limit for limit in limits)]
+    return (
+        f'<rect x="{left:.1f}" y="{top:.1f}" width="{max(width, 1.0):.1f}" height="{_LANE - 2:.0f}" fill="{colour}" '
+        f'stroke="#999999" stroke-width="0.5"><title>{escape(words)}</title></rect>'
+    )
+
+
+def _shades(top: float, what: str, limits: Sequence[float]) -> list[str]:
+    names = [f"to {limits[0]:g}", *(f"to {limit:g}" for limit in limits[1:]), f"over {limits[-1]:g}"]
+    parts = [text(8.0, top + 11.0, what)]
+    for number, (name, shade) in enumerate(zip(names, _SHADES, strict=True)):
+        left = _STRIP_LEFT + 110.0 * number
+        parts.append(f'<rect x="{left:.0f}" y="{top:.0f}" width="14" height="13" fill="{shade}" stroke="#999999"/>')
+        parts.append(text(left + 20.0, top + 11.0, name))
     return parts

@@ -1,4 +1,4 @@
-"""Exact standard deviations of EWMA monitors at a constant rate and sigma (DOMAIN section 3)."""
+"""Sigmas of EWMA monitors by the replay's own recursion and by the closed form, beside the experiment's bank."""
 
 from __future__ import annotations
 

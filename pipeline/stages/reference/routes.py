@@ -1,4 +1,4 @@
-"""The net elements that a train may have visited one after the other, and the ways through them."""
+"""The net elements that a train may have visited one after the other, and the routes through them."""
 
 from __future__ import annotations
 
@@ -44,8 +44,8 @@ class ElementStay:
     back: bool
 
 
-def ways_over(nodes: Sequence[VisitNode], last: int, most: int) -> list[list[ElementStay]]:
-    """Ways from the first step to the last that together run over every link between visits.
+def routes_over(nodes: Sequence[VisitNode], last: int, most: int) -> list[list[ElementStay]]:
+    """Routes from the first step to the last that together run over every link between visits.
 
     Nothing where there are more than `most`.
     """
@@ -53,36 +53,39 @@ def ways_over(nodes: Sequence[VisitNode], last: int, most: int) -> list[list[Ele
     leading_on = _closure(ends, forward=False)
     begins = {node for node in leading_on if node.first == 0 and node.sampled}
     alive = leading_on & _closure(begins, forward=True)
-    ways = [_stays(node, [], last) for node in nodes if node in begins & ends & alive]
+    routes = [_stays(node, [], last) for node in nodes if node in begins & ends & alive]
     covered: set[Link] = set()
     for link in [link for node in nodes if node in alive for link in node.after if link.there in alive]:
-        links = None if link in covered else _way_over(link, begins, ends, alive, covered)
+        links = None if link in covered else _route_over(link, begins, ends, alive, covered)
         if links is not None:
-            ways.append(_stays(links[0].here, links, last))
+            routes.append(_stays(links[0].here, links, last))
             covered |= set(links)
-        if len(ways) > most:
+        if len(routes) > most:
             return []
-    return ways
+    return routes
 
 
 def _closure(start: set[VisitNode], forward: bool) -> set[VisitNode]:
     """All visits reachable from `start`, forward or backward in time."""
-    seen: set[VisitNode] = set()
+    reached: set[VisitNode] = set()
     to_visit = list(start)
     while to_visit:
         node = to_visit.pop()
-        if node not in seen:
-            seen.add(node)
+        if node not in reached:
+            reached.add(node)
             to_visit += [link.there for link in node.after] if forward else [link.here for link in node.before]
-    return seen
+    return reached
 
 
-def _way_over(
+def _route_over(
     link: Link, begins: set[VisitNode], ends: set[VisitNode], alive: set[VisitNode], covered: set[Link]
 ) -> list[Link] | None:
-    """A whole way over a link, grown at both ends; each next link is the nearest in time, then one not yet covered."""
+    """A whole route over a link, grown at both ends; each next link is the nearest in time, then one not yet
+    covered.
+    """
 
     def nearest(links: list[Link]) -> Link | None:
+        """The link nearest in time to the one grown from; of equal ones one that no route covers yet."""
         return min(links, key=lambda option: (abs(option.at - link.at), option in covered), default=None)
 
     links = [link]
@@ -102,7 +105,7 @@ def _way_over(
 
 
 def _stays(start: VisitNode, links: Sequence[Link], last: int) -> list[ElementStay]:
-    """The elements that a way from a visit over these links runs over, in order of time; `last`: the last step."""
+    """The elements that a route from a visit over these links runs over, in order of time; `last`: the last step."""
     stays: list[ElementStay] = []
     node = start
     entered = 0
@@ -116,10 +119,10 @@ def _stays(start: VisitNode, links: Sequence[Link], last: int) -> list[ElementSt
     return [*stays, ElementStay(node.oriented, entered, last, back)]
 
 
-def ways_of(found: PathSet, config: MatchingConfig, most: int) -> tuple[int, list[list[ElementStay]]]:
-    """Ways to the last step that together run over every hypothesis that nothing refutes, and the step they begin at.
+def routes_of(found: PathSet, config: MatchingConfig, most: int) -> tuple[int, list[list[ElementStay]]]:
+    """Routes to the last step that together run over every hypothesis that nothing refutes, and the step they begin at.
 
-    Steps of stays count from there: the first one, or where a movement led back after every path was refuted. No ways
+    Steps of stays count from there: the first one, or where a movement led back after every path was refuted. No routes
     where there are more than `most`, and where every path is refuted: a set that began anew without such a movement
     knows nothing of what went wrong before.
     """
@@ -131,15 +134,15 @@ def ways_of(found: PathSet, config: MatchingConfig, most: int) -> tuple[int, lis
     visits = {
         key: VisitNode(node.oriented, node.begin - first, node.end - 1 - first)
         for key, node in nodes.items()
-        if _lasts(node)
+        if _covers_a_step(node)
     }
     moves = Moves.without_odometer(found.network, found.steps, config)
     every = list(visits.values())
     for key, visit in visits.items():
         node = nodes[key]
         for origin, end in _origins(node):
-            every += _linked(moves, visits[id(origin)], visit, origin, node, end, first)
-    return first, [_without_cuts(way) for way in ways_over(every, count - 1 - first, most)]
+            every += _link_visits(moves, visits[id(origin)], visit, origin, node, end, first)
+    return first, [_without_cuts(route) for route in routes_over(every, count - 1 - first, most)]
 
 
 def _living(found: PathSet, stretch: int) -> Iterator[Node]:
@@ -155,7 +158,7 @@ def _living(found: PathSet, stretch: int) -> Iterator[Node]:
             waiting += node.origins
 
 
-def _lasts(node: Node) -> bool:
+def _covers_a_step(node: Node) -> bool:
     """It covers a step: others only led from one element to the next."""
     return node.end > node.begin
 
@@ -165,13 +168,13 @@ def _origins(node: Node) -> Iterator[tuple[Node, int]]:
     waiting = [(origin, node.begin if origin is node.parent else origin.end) for origin in node.origins]
     while waiting:
         origin, step = waiting.pop()
-        if _lasts(origin):
+        if _covers_a_step(origin):
             yield origin, step
         else:
             waiting += [(further, step) for further in origin.origins]
 
 
-def _linked(
+def _link_visits(
     moves: Moves, here: VisitNode, there: VisitNode, origin: Node, node: Node, step: int, first: int
 ) -> list[VisitNode]:
     """Link two visits behind the step before `step`; returns visits of elements between, on which no sample lies.
@@ -181,7 +184,7 @@ def _linked(
     begin = _place(origin, step - 1)
     end = _place(node, step)
     move = moves.best(begin, end)
-    if move is None or moves.cost(begin, end, moves.way(begin.step, end.step)) >= moves.break_cost:
+    if move is None or moves.cost(begin, end, moves.distance(begin.step, end.step)) >= moves.break_cost:
         return []
     at = step - 1 - first
     sense = move.sense or 1
@@ -194,7 +197,7 @@ def _linked(
 
 
 def _place(node: Node, step: int) -> Place:
-    """Where a path was at one of its steps."""
+    """Place of a path at one of its steps."""
     row = min(max(step - node.begin, 0), node.end - node.begin - 1)
     return Place(step, node.oriented, float(node.left_m[row, node.oriented % 2]))
 

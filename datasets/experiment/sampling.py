@@ -1,6 +1,10 @@
-"""Missed detections down to 1e-9 and far below: noise twisted towards the most probable miss, runs split as they go.
+"""Probabilities down to 1e-9 and far below, of any linear Gaussian system: false alarms and missed detections.
 
-A miss is a path of the monitors that stays inside all thresholds although the fault pushes it out. That set is
+False alarm within a horizon (Adler, Blanchet and Liu 2012): an exceedance is forced at a monitor and epoch drawn
+at random, the rest of the path follows by conditioning, and the expected number of exceedances over the number seen is
+an unbiased estimate of the probability of at least one.
+
+Missed detection: a path of the monitors that stays inside all thresholds although the fault pushes it out. That set is
 convex in the noise, so the noise is shifted by its most probable point (the least-norm solution of a small
 quadratic programme). Shifting alone fails where many thresholds are near at once: hardly a run survives, and one
 lucky weight decides. So the runs are carried as a population (sequential Monte Carlo, Del Moral 2004, section 9.4):
@@ -10,16 +14,28 @@ is an unbiased estimate for any number of runs; independent populations give its
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from functools import partial
+from math import isfinite
 from typing import ClassVar, NamedTuple, Protocol
 
 import numpy as np
 from scipy.optimize import nnls
 
+from datasets.experiment.tables import Row
+from datasets.experiment.workers import in_pieces
 from schemas.arrays import Bools, Floats, Ints
 
 Step = Callable[[int, Floats], tuple[Floats, Floats]]
 
+# Paths of all monitors must fit into some 64 MB.
+_LARGEST_BLOCK = 8_000_000
+# Independent populations of a split estimate: their scatter is its error.
+_POPULATIONS = 20
+_SMALLEST_POPULATION, _LARGEST_POPULATION = 250, 1_000
+_CLOSE_ENOUGH = 0.02
+SMALLEST = 1e-12
+"""No probability smaller than this is given, only that it is below."""
 _MOST_CONSTRAINTS = 120
 # The shifted path stays so many sigmas (`System.margins`) inside the limits: with many constraints at once more runs
 # survive. A slow ramp whose mean never comes near a limit needs more of it, until the shift is worth something.
@@ -79,8 +95,8 @@ class System(Protocol):
     def limits(self, epochs: int, rate_mps: float) -> Limits:
         """Half-spaces around all values without a fail."""
 
-    def seen(self, values: Floats) -> Floats:
-        """Of (..., values) what the limits hold, (..., limits)."""
+    def on_limits(self, values: Floats) -> Floats:
+        """What each limit bounds, of `values` (..., values): (..., limits)."""
 
     def towards_limit(self, epochs: int) -> Callable[[int, int], Floats]:
         """Covariance of the values at epochs 1 .. n with a limit at an epoch (from 1), (epochs, values)."""
@@ -98,6 +114,122 @@ class System(Protocol):
 
     def fails(self, path: Floats) -> int:
         """Fails of one run, (epochs, values)."""
+
+
+def root_of(covariance: Floats) -> Floats:
+    """A matrix R with R R' = `covariance` (n, n), which may be singular."""
+    values, vectors = np.linalg.eigh(covariance)
+    return np.asarray(vectors * np.sqrt(np.maximum(values, 0.0)))
+
+
+class Probability(NamedTuple):
+    """An estimate with its relative standard error, and how many plain runs it is worth per run made."""
+
+    value: float
+    relative_error: float
+    variance_reduction: float
+    runs: int
+
+
+def false_alarm_probability(system: System, epochs: int, runs: int = 4000, seed: int = 1, jobs: int = 1) -> Probability:
+    """Probability that healthy monitors, long after their restart, fail at least once in this many epochs.
+
+    `runs`: sampled paths. Raises `ValueError` for a bank whose restart is not long ago.
+    """
+    # Small enough for one thread of the linear algebra library, whose threads would cost more than they bring.
+    size = max(1, min(system.runs_per_block, _LARGEST_BLOCK // (epochs * system.size)))
+    alarms = partial(_alarms, system, epochs)
+    return pooled(np.concatenate(in_pieces(alarms, runs, size, (seed, system.streams[0]), jobs)), runs)
+
+
+def missed_detection_probability(
+    system: System, epochs: int, rate_mps: float, runs: int = 20_000, seed: int = 1, jobs: int = 1
+) -> Probability:
+    """Probability that no monitor fails at epochs 1 .. n of a range ramp of `rate_mps`; `runs`: sampled paths."""
+    miss = partial(miss_estimate, system, epochs, rate_mps, most_probable_miss(system, epochs, rate_mps))
+    return pooled(np.array(in_pieces(miss, runs, population_of(runs), (seed, system.streams[1]), jobs)), runs)
+
+
+def population_of(runs: int) -> int:
+    """Size of the independent populations that share the runs; too small ones would lose all of theirs."""
+    return min(max(runs // _POPULATIONS, _SMALLEST_POPULATION), _LARGEST_POPULATION)
+
+
+def pooled(estimates: Floats, runs: int) -> Probability:
+    """Mean of independent unbiased estimates of equal weight, its relative error, and the gain over counting."""
+    greatest = float(estimates.max())
+    if greatest == 0.0:
+        return Probability(0.0, float("inf"), 1.0, runs)
+    # In units of the greatest, so that the squares of 1e-200 are still numbers.
+    shares = estimates / greatest
+    error = float(np.sqrt(shares.var(ddof=1) / shares.size) / shares.mean()) if shares.size > 1 else float("inf")
+    mean = greatest * float(shares.mean())
+    gain = (1.0 - mean) / mean / runs / error**2 if error > 0 else float("inf")
+    return Probability(mean, error, gain, runs)
+
+
+def _alarms(system: System, epochs: int, runs: int, rng: np.random.Generator) -> Floats:
+    # Stationary: the covariance depends on the lag alone, and lag zero is in the middle.
+    by_lag = system.by_lag(epochs)
+    paths = np.empty((epochs, system.size, runs))
+    state = system.start(runs, rng)
+    for path in paths:
+        state = system.following(state, rng)
+        path[:] = system.values(state)
+    at = rng.integers(0, epochs, runs)
+    pulls, per_epoch = system.forced(paths[at, :, np.arange(runs)], rng)
+    estimates = np.empty(runs)
+    for run, (place, pull) in enumerate(zip(at, pulls, strict=True)):
+        pulled = np.flatnonzero(pull)
+        together = by_lag[epochs - 1 - place : 2 * epochs - 1 - place, pulled]
+        # The forced one counts, whatever rounding does to it.
+        count = max(system.fails(paths[:, :, run] + pull[pulled] @ together), 1)
+        estimates[run] = epochs * per_epoch / count
+    return estimates
+
+
+def figures(result: Probability) -> Row:
+    """The estimate as it stands in a table; nulls where no run came through, which says nothing of the probability.
+
+    Below `SMALLEST` it is not given: the model of the noise does not hold so far out. `below` says so in its place.
+    """
+    shown = result.value >= SMALLEST
+    return {
+        "probability": result.value if shown else None,
+        "below": SMALLEST if 0.0 < result.value < SMALLEST else None,
+        "relative_error": result.relative_error if shown and isfinite(result.relative_error) else None,
+        "variance_reduction": result.variance_reduction if shown and isfinite(result.variance_reduction) else None,
+        "runs": result.runs,
+    }
+
+
+def first_below(probability: Callable[[int], float], targets: Sequence[float], most_epochs: int) -> list[int | None]:
+    """Epochs after which a falling probability is below each target, within 2 %; None if that takes too many.
+
+    Few runs per step do: time is found far better than probability, which falls steeply. An estimate of zero, all
+    runs lost, says nothing and counts as not below.
+    """
+    known: dict[int, float] = {}
+
+    def below(epochs: int, target: float) -> bool:
+        if epochs not in known:
+            known[epochs] = probability(epochs)
+        return 0.0 < known[epochs] < target
+
+    return [_bisected(below, target, most_epochs) for target in targets]
+
+
+def _bisected(below: Callable[[int, float], bool], target: float, most_epochs: int) -> int | None:
+    low, high = 1, 8
+    while not below(high, target):
+        if high >= most_epochs:
+            return None
+        low = high
+        high = min(2 * high, most_epochs)
+    while high - low > max(1, _CLOSE_ENOUGH * high):
+        middle = (low + high) // 2
+        low, high = (low, middle) if below(middle, target) else (middle, high)
+    return high
 
 
 def most_probable_miss(system: System, epochs: int, rate_mps: float) -> MeanShift:
@@ -124,7 +256,7 @@ def _shift(system: System, limits: Limits, margin: float, towards_limit: Callabl
     multiplier = np.zeros(0)
     gram = np.zeros((0, 0))
     for _ in range(_MOST_CONSTRAINTS):
-        excess = (towards * (ramp + system.seen(mean)) - threshold) / sigma
+        excess = (towards * (ramp + system.on_limits(mean)) - threshold) / sigma
         worst = np.unravel_index(int(excess.argmax()), excess.shape)
         if excess[worst] < -0.5 * margin:
             break
@@ -133,7 +265,7 @@ def _shift(system: System, limits: Limits, margin: float, towards_limit: Callabl
         columns.append(towards[worst[1]] * towards_limit(limit[-1], epoch[-1]))
         at = np.array(epoch) - 1
         which = np.array(limit)
-        gram = np.array([(towards[which] * system.seen(column)[at, which]) for column in columns])
+        gram = np.array([(towards[which] * system.on_limits(column)[at, which]) for column in columns])
         needed = towards[which] * ramp[at, which] - threshold[at, which] + margin * sigma[at, which]
         multiplier = least_norm(gram, needed)
         mean = -np.einsum("c,ckm->km", multiplier, np.array(columns))
@@ -163,7 +295,7 @@ def miss_estimate(
         weight = np.where(passing(k, noise + moved[k][:, None]), 0.0, -np.inf)
         # Density of the true noise over that of the shifted one: exp(l' m - l' C l / 2), m the noise at constraints.
         for index in np.flatnonzero(shift.epoch == k + 1):
-            weight += shift.multiplier[index] * system.seen(noise.T)[:, shift.limit[index]]
+            weight += shift.multiplier[index] * system.on_limits(noise.T)[:, shift.limit[index]]
         return following, weight
 
     return float(np.exp(log_survival(system.start(runs, rng), step, epochs, rng) - shift.half_square))

@@ -1,24 +1,72 @@
-"""The pseudorange monitor where counting cannot reach: misses of a ramp, and alarms of healthy ranges.
+"""The pseudorange monitor as a `System`: misses of a ramp, and alarms of healthy ranges, where counting cannot reach.
 
+Range errors are those of each satellite (DIAG Table 1); the train is held on its surveyed track, whose error is
+constant in a run. Residuals may be recorded more slowly than positions: the monitor then looks at these epochs only.
 Its value is |z|^2 of a Gaussian vector z (the whitened residuals): one Gauss-Markov vector per error source, and the
 survey's error, which stays. A miss is a path of z + ramp that stays inside a ball, which is convex again, so the same
-twisted population serves (`splitting`). Alarms: an exceedance is forced at an epoch drawn at random, as in `rare`.
+twisted population serves (`sampling`). Alarms: an exceedance is forced at an epoch drawn at random.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from functools import cached_property
-from typing import ClassVar
+from typing import ClassVar, NamedTuple
 
 import numpy as np
 from scipy.special import chdtr, chdtri
 
-from datasets.experiment.geometry import TAUS_S
-from datasets.experiment.ranges import RangePlan, held_rows, statistic
-from datasets.experiment.splitting import Limits
+from datasets.experiment.geometry import TAUS_S, Geometry
+from datasets.experiment.sampling import Limits, root_of
+from pipeline.stages.monitors.pseudorange import clock_columns, line_of_sight_rows
 from schemas.arrays import Bools, Floats
 from schemas.frozen import frozen
+
+
+@frozen
+class RangePlan:
+    """A sky and the monitor's setting: `period_s` between recorded residuals, `survey_m` sigma of the track survey."""
+
+    geometry: Geometry
+    period_s: float = 1.0
+    survey_m: float = 1.0
+    failure_limit_m: float = 20.0
+    false_alarm_probability: float = 1e-7
+
+    def mean_failure_s(self, heading_deg: float, rate_mps: float) -> float:
+        """When the mean error along the track of a ramp passes the limit [s]; infinite where it never does."""
+        slope = abs(float(self.geometry.axes(heading_deg)[0] @ self.geometry.ramp_direction)) * rate_mps
+        return self.failure_limit_m / slope if slope > 0 else float("inf")
+
+
+class Statistic(NamedTuple):
+    """`value = |project @ r|^2` of range errors r, chi-square with `project.shape[0]` degrees of freedom."""
+
+    project: Floats
+    threshold: float
+
+
+def statistic(plan: RangePlan, heading_deg: float) -> Statistic:
+    """The monitor of `pipeline.stages.monitors.pseudorange` for a fixed sky and heading, as one projection.
+
+    Ranges have covariance V = diag(sigma^2) + survey^2 (g_c g_c' + g_u g_u'); along and clocks are free.
+    """
+    geometry = plan.geometry
+    rows = line_of_sight_rows(geometry.azimuth_deg, geometry.elevation_deg)
+    axes = geometry.axes(heading_deg)
+    held = held_rows(plan, heading_deg)
+    covariance = np.diag(geometry.range_variance_m2.sum(axis=1)) + plan.survey_m**2 * held @ held.T
+    whiten = np.linalg.inv(np.linalg.cholesky(covariance))
+    free = whiten @ np.column_stack([rows @ axes[0], clock_columns(geometry.svs)])
+    basis, _ = np.linalg.qr(free, mode="complete")
+    kept = basis[:, free.shape[1] :].T
+    return Statistic(kept @ whiten, float(chdtri(kept.shape[0], plan.false_alarm_probability)))
+
+
+def held_rows(plan: RangePlan, heading_deg: float) -> Floats:
+    """Range change per metre of survey error across and in height, shape (satellites, 2)."""
+    rows = line_of_sight_rows(plan.geometry.azimuth_deg, plan.geometry.elevation_deg)
+    return np.asarray(rows @ plan.geometry.axes(heading_deg)[1:].T)
 
 
 @frozen
@@ -50,11 +98,10 @@ class RangeSystem:
 
     def start(self, runs: int, rng: np.random.Generator) -> Floats:
         """States at the onset: sources, then the survey, d rows each; (states, runs)."""
-        parts = [_root(one) @ rng.standard_normal((self.size, runs)) for one in (*self.covariance, self.survey)]
+        parts = [root_of(one) @ rng.standard_normal((self.size, runs)) for one in (*self.covariance, self.survey)]
         return np.concatenate(parts)
 
     def following(self, state: Floats, rng: np.random.Generator) -> Floats:
-        """States at the next recorded epoch."""
         sources = len(self.phi)
         moving = state.reshape(sources + 1, self.size, -1).copy()
         fresh = rng.standard_normal((sources, self.size, state.shape[1]))
@@ -64,7 +111,7 @@ class RangeSystem:
 
     @cached_property
     def _push(self) -> Floats:
-        push: Floats = np.sqrt(1.0 - self.phi**2)[:, None, None] * np.array([_root(one) for one in self.covariance])
+        push: Floats = np.sqrt(1.0 - self.phi**2)[:, None, None] * np.array([root_of(one) for one in self.covariance])
         return push
 
     def values(self, state: Floats) -> Floats:
@@ -78,9 +125,9 @@ class RangeSystem:
         """Along the ramp alone: what the other directions take of the ball on average is not there for it."""
         radius = np.sqrt(max(self.threshold - (self.size - 1), 1.0))
         one = np.ones((epochs, 1))
-        return Limits(self.seen(self.ramp(epochs, rate_mps)), radius * one, one, np.ones(1))
+        return Limits(self.on_limits(self.ramp(epochs, rate_mps)), radius * one, one, np.ones(1))
 
-    def seen(self, values: Floats) -> Floats:
+    def on_limits(self, values: Floats) -> Floats:
         return np.asarray(values @ self._along)[..., None]
 
     @cached_property
@@ -105,14 +152,8 @@ class RangeSystem:
         return int((np.square(path).sum(axis=1) > self.threshold).sum())
 
 
-def _root(covariance: Floats) -> Floats:
-    """A matrix with this covariance, which may be singular (the survey's has two dimensions)."""
-    values, vectors = np.linalg.eigh(covariance)
-    return np.asarray(vectors * np.sqrt(np.maximum(values, 0.0)))
-
-
 def range_system(plan: RangePlan, heading_deg: float) -> RangeSystem:
-    """The monitor of a plan at a heading, as `ranges.statistic` has it."""
+    """The monitor of a plan at a heading, as `statistic` has it."""
     one = statistic(plan, heading_deg)
     scaled = one.project[:, None, :] * np.sqrt(plan.geometry.range_variance_m2).T[None]
     covariance = np.einsum("asn,bsn->sab", scaled, scaled)
