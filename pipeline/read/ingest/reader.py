@@ -84,6 +84,6 @@ def _concat_parts(parts: list[Values], dtype: pl.DataType, order: Ints | None = 
     arrays = [part for part in parts if isinstance(part, np.ndarray)]
     if parts and len(arrays) == len(parts):
         values = np.concatenate(arrays)
-        return pl.Series(values if order is None else values[order], dtype=dtype)
+        return pl.Series(values if order is None else values.take(order), dtype=dtype)
     whole = pl.concat([pl.Series(dtype=dtype), *(pl.Series(part, dtype=dtype) for part in parts)], rechunk=True)
     return whole if order is None or whole.null_count() == len(whole) else whole.gather(order)
