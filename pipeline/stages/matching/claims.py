@@ -263,7 +263,9 @@ def claims(found: PathSet, t_s: Floats, element: Ints, sigma_m: Floats, config: 
     about = np.clip(np.searchsorted(steps.end_s, t_s, side="left"), 0, count - 1)
     speed_mps = steps.distance_m / np.maximum(np.diff(steps.end_s, prepend=steps.begin_s[0]), 1e-3)
     since_s = np.where(before >= 0, t_s - steps.end_s[np.maximum(before, 0)], 0.0)
-    carried_m = 1.2 * speed_mps[np.maximum(before, 0)] * since_s + config.paths_along_sigmas * np.nan_to_num(sigma_m)
+    # How far the train may have come since the last test: a branch nearer than that may lie behind it already.
+    driven_m = config.paths_faster * speed_mps[np.maximum(before, 0)] * since_s
+    carried_m = driven_m + config.paths_along_sigmas * np.nan_to_num(sigma_m)
     group = np.where(element >= 0, found.groups[np.maximum(element, 0)], -1)
     alone = _alone(found)
     live = _lines_left(found, found.living(config.paths_delay_s), OneTrack(found, config.paths_one_track_m))
