@@ -82,9 +82,9 @@ def config_of(log: Path) -> IngestConfig:
 # Largest ratio to reading and decompressing, and smallest to `mcap` with its decoder package. Of JSON the parser alone
 # takes 2.1 (orjson, which makes no columns, 4.2), its columns 2.3, its texts side by side 1.
 TARGETS: dict[Case, tuple[float, float]] = {
-    "cdr Odometry": (4.2, 70.0),
-    "cdr TwistStamped": (3.2, 50.0),
-    "protobuf": (4.6, 14.0),
+    "cdr Odometry": (2.5, 70.0),
+    "cdr TwistStamped": (2.2, 50.0),
+    "protobuf": (3.5, 14.0),
     "json": (9.0, 5.0),
 }
 _CRC_NS_PER_BYTE = 0.25
