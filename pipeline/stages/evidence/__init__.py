@@ -3,12 +3,13 @@
 In: reference, balise reads, odometer, survey, figures of the vehicle file. Out: evidence at any instants.
 Nothing that came from GNSS is known here, and nothing of matching, alignment, monitors, LDS or judge is imported.
 
-`evidence` is asked for any instants; `gathering` makes it of all recorders. Which places are known at which instants:
+`evidence` is asked for any instants; `gathering` makes it of all recorders; `places` gives it as columns. What is known when:
 `anchors`. What contradicts a reference: `contradictions`. By which clock, and how far does the odometer carry them:
 `carrying`. Which chains of net elements lead from one to the next: `gaps`.
 """
 
 from pipeline.stages.evidence.evidence import EvidenceSet, TrainEvidence, either
-from pipeline.stages.evidence.gathering import TruePlaces, evidence_of, true_places
+from pipeline.stages.evidence.gathering import evidence_of
+from pipeline.stages.evidence.places import TruePlaces, true_places
 
 __all__ = ["EvidenceSet", "TrainEvidence", "TruePlaces", "either", "evidence_of", "true_places"]

@@ -5,11 +5,9 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import replace
 from itertools import pairwise
-from typing import NamedTuple
 
 import numpy as np
 import polars as pl
-import pyarrow as pa
 
 from pipeline.stages.evidence.anchors import (
     KnownStretch,
@@ -41,16 +39,14 @@ from pipeline.stages.evidence.contradictions import (
     levels_beyond,
     path_speed_mps,
 )
-from pipeline.stages.evidence.evidence import Alternative, EvidenceSet, Span, TrainEvidence
+from pipeline.stages.evidence.evidence import Span, TrainEvidence
 from pipeline.stages.evidence.gaps import Carried, GapSearch
 from pipeline.stages.odometry import Odometry
 from pipeline.stages.reference import ReferenceStretch
 from pipeline.stages.track.network import Network
-from pipeline.stages.track.survey import SurveyedTrack
 from schemas.arrays import NS_PER_S, Floats, Ints, floats, times_ns
 from schemas.config import Configuration, HazardConfig, Vehicle
 from schemas.enums import Origin
-from schemas.frozen import frozen
 
 
 def on_time(stream: pl.DataFrame | None, latency_s: float) -> pl.DataFrame | None:
@@ -357,91 +353,3 @@ def _parted(odometers: Sequence[Odometry], config: Configuration) -> bool:
             if (np.abs(moved_m[0] - moved_m[1]) > allowed_m).any():
                 return True
     return False
-
-
-@frozen
-class TruePlaces:
-    """Where the train was at each instant by the evidence; shape (instants,)."""
-
-    netelement_ids: pl.Series
-    """Every net element that the evidence leaves, in the order of the survey; null where nothing is known."""
-    low_m: Floats
-    """Least measure where one net element is left [m]."""
-    high_m: Floats
-    """Largest measure there [m]."""
-
-    def at(self, rows: Ints) -> TruePlaces:
-        """Those of some instants."""
-        return TruePlaces(self.netelement_ids[rows], self.low_m[rows], self.high_m[rows])
-
-    def columns(self) -> list[pl.Series]:
-        """As they stand in `epochs`."""
-        return [
-            self.netelement_ids.alias("true_netelement_ids"),
-            pl.Series("true_measure_low_m", self.low_m, nan_to_null=True),
-            pl.Series("true_measure_high_m", self.high_m, nan_to_null=True),
-        ]
-
-
-def true_places(evidence: EvidenceSet, track: SurveyedTrack) -> TruePlaces:
-    """Every net element that one of the alternatives touches, with the measures on it.
-
-    Args:
-        evidence: where the train was, at n instants.
-        track: the survey, whose elements the evidence numbers.
-
-    Returns:
-        Net elements and measures [m] of n instants.
-    """
-    parts = [_touched(alternative) for alternative in evidence.alternatives]
-    row, element = (np.concatenate([np.zeros(0, np.int64), *(getattr(part, name) for part in parts)]) for name in _KEYS)
-    ends_m = [np.concatenate([np.zeros(0), *(getattr(part, name) for part in parts)]) for name in ("low_m", "high_m")]
-    order = np.lexsort((element, row))
-    row, element, low_m, high_m = (values[order] for values in (row, element, *ends_m))
-    size = evidence.kind.size
-    begins = np.flatnonzero(np.diff(row, prepend=-1))
-    # Each net element once an instant, however often the train's routes lead over it.
-    once = np.diff(row * len(track.ids) + element, prepend=-1) != 0
-    counts = np.bincount(row[once], minlength=size)
-    places_m = np.full((2, size), np.nan)
-    if begins.size:
-        places_m[:, row[begins]] = np.minimum.reduceat(low_m, begins), np.maximum.reduceat(high_m, begins)
-    names = pl.Series(track.ids, dtype=pl.String)[element[once]]
-    offsets = np.concatenate([[0], np.cumsum(counts)]).astype(np.int32)
-    lists = pa.ListArray.from_arrays(pa.array(offsets), names.to_arrow(), mask=pa.array(counts == 0))
-    return TruePlaces(pl.Series(lists, dtype=pl.List(pl.String)), *np.where(counts == 1, places_m, np.nan))
-
-
-_KEYS = ("row", "element")
-
-
-class _Touched(NamedTuple):
-    """Net elements that an interval touches: one each instant and visit."""
-
-    row: Ints
-    element: Ints
-    low_m: Floats
-    high_m: Floats
-
-
-def _touched(there: Alternative) -> _Touched:
-    route = there.route
-    first, last = (
-        np.maximum(np.searchsorted(route.entry_m, at_m, side="right") - 1, 0) for at_m in (there.low_m, there.high_m)
-    )
-    count = last - first + 1
-    # Each instant `count` times, and with it the visits from its first on.
-    numbers = np.repeat(np.arange(there.rows.size), count)
-    visit = np.repeat(first - np.concatenate([[0], np.cumsum(count)[:-1]]), count) + np.arange(count.sum())
-    low = route.low_m[visit]
-    high = route.high_m[visit]
-    begin, end = (
-        np.clip(at_m[numbers] - route.entry_m[visit], 0.0, high - low) for at_m in (there.low_m, there.high_m)
-    )
-    forward = route.forward[visit]
-    return _Touched(
-        row=there.rows[numbers],
-        element=route.element[visit],
-        low_m=np.where(forward, low + begin, high - end),
-        high_m=np.where(forward, low + end, high - begin),
-    )
