@@ -54,3 +54,17 @@ def test_what_needs_no_table_loads_no_tables(arguments: list[str]) -> None:
 def test_a_log_needs_no_search_trees_and_no_matrices(small_trial: SmallTrial, tmp_path: Path) -> None:
     lines = said(OF_A_LOG, small_trial.paths[0], small_trial.site, tmp_path / "out")
     assert [line for line in lines if line.startswith("[") and line.endswith("]")][-2:] == ["[]", "[]"]
+
+
+REPLAYED = """
+import sys, cli
+log, site, out = sys.argv[1:]
+cli._guarded(['replay', log, '--site', site, '--out', out, '--quiet'], False)
+print([name for name in ('pandas', 'matplotlib', 'shapely', 'duckdb', 'msgspec', 'dask') if name in sys.modules])
+"""
+
+
+def test_a_replay_loads_nothing_that_only_others_need(small_trial: SmallTrial, tmp_path: Path) -> None:
+    """Some libraries load pandas when they are handed an array, if it is there."""
+    assert said(REPLAYED, small_trial.paths[0], small_trial.site, tmp_path / "out")[-1] == "[]"
+    assert (tmp_path / "out" / "runs").is_dir()
