@@ -100,7 +100,10 @@ def _epochs(system: LocationSystem, journey: Journey, config: LdsConfig) -> LdsE
     names = [None if change.lrvb is None else change.lrvb.balise.balise_id for change in changes]
     numbers = {name: number for number, name in enumerate(dict.fromkeys(name for name in names if name is not None))}
     distance_m, doubt_m = _reported_m(changes, index, journey, config)
-    withheld_for = np.array([_LOST_TO.get(cause, -1) for cause in system.withheld_for], dtype=np.int64)
+    withheld_for = np.full(journey.t_ns.size, -1)
+    for epoch, cause in enumerate(system.withheld_for):
+        if cause is not None:
+            withheld_for[epoch] = _LOST_TO[cause]
     withheld = withheld_for >= 0
     return LdsEpochs(
         lds_mode=_modes(system, index, journey, withheld),
@@ -119,7 +122,7 @@ def _epochs(system: LocationSystem, journey: Journey, config: LdsConfig) -> LdsE
     )
 
 
-_LOST_TO: dict[LostTo | None, int] = {cause: number for number, cause in enumerate(LostTo)}
+_LOST_TO = {cause: number for number, cause in enumerate(LostTo)}
 
 
 def _diagnosis_faulty(system: LocationSystem, journey: Journey, withheld: Bools) -> Bools:
