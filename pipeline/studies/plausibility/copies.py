@@ -20,7 +20,6 @@ from schemas.enums import Fix, MisfitCause
 
 _WHAT = "reference against the positions"
 _ADVICE = "Leave the reference out of the run, or record one with another, better instrument."
-_AXES = ("latitude_deg", "longitude_deg")
 # Fewer moving places in common show nothing.
 _FEWEST = 3 * LEAST
 # Degrees, minutes and seconds of an angle are written with so many decimals; finer is rounding of the computer [deg].

@@ -88,7 +88,7 @@ def fit_report(
         else:
             fit = fit_run(cleaned, name, vehicle or Vehicle(), config.plausibility, site)
             fits[name] = with_checks(fit, follows_checks(cleaned, name, config))
-    tables = {"Fit": _checks(fits, counts)}
+    tables = {"Fit": _table_of_checks(fits, counts)}
     if (origins := origins_table(cleaned, vehicle or Vehicle(), config)).height:
         tables[ODOMETERS] = origins
     mending: dict[str, str] = {}
@@ -110,7 +110,7 @@ def _in_order(run: RunLog) -> RunLog:
     return run.with_streams(**{name: frame.sort("t") for name in streams if (frame := run.stream(name)) is not None})
 
 
-def _checks(fits: dict[str, Fit], counts: CleanCounts) -> pl.DataFrame:
+def _table_of_checks(fits: dict[str, Fit], counts: CleanCounts) -> pl.DataFrame:
     """One row per check of each solution, with what cleaning left out."""
     columns = ("solution", "check", "state", "found", "cause")
     rows = [
