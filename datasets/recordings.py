@@ -14,7 +14,7 @@ from pipeline.project.convert import Recordings
 from pipeline.read.ingest import read_run
 from pipeline.read.ingest.parts import LogPart, drafts_of, lines_of_parts
 from pipeline.storage.noted import note_all_below, noting
-from pipeline.studies.plausibility.report import FitReport, fit_report
+from pipeline.studies.plausibility.fit import FitReport, fit_report
 from schemas.config import Configuration, IngestConfig
 from schemas.errors import visible
 from schemas.frozen import frozen

@@ -15,8 +15,7 @@ from pipeline.stages.monitored import MonitoredSolution, monitor_solution
 from pipeline.stages.prepare import PreparedRun, prepare
 from pipeline.stages.run_row.lost_time import lost_columns
 from pipeline.stages.run_row.summary import SolutionResults, failed_row, notes_of_replay, summarise
-from pipeline.studies.plausibility.fit import Fit, clock_advice, required_fit, with_checks
-from pipeline.studies.plausibility.report import accuracy_checks, refuted
+from pipeline.studies.plausibility.fit import Fit, accuracy_checks, clock_advice, refuted, required_fit, with_checks
 from pipeline.studies.undetected.columns import Undetected, unnoticed_of
 from schemas.config import Configuration, Vehicle
 from schemas.conform import shaped

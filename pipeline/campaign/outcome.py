@@ -14,7 +14,7 @@ from pipeline.results.figures.hazard_words import hazard_words
 from pipeline.results.figures.head import worst_verdict
 from pipeline.results.figures.known_counts import HAZARD_COUNTS, known_counts
 from pipeline.results.outcome import VERDICT_FIGURES, RunOutcome
-from pipeline.stages.provenance import Provenance
+from pipeline.stages.prepare import Provenance
 from pipeline.storage.address import Address, redacted
 from schemas.enums import RunStatus, RunVerdict
 from schemas.errors import BaliseError, InputError

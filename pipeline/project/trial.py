@@ -27,7 +27,7 @@ from pipeline.read.site.alike import ambiguities, summarise_findings
 from pipeline.read.site.read import read_site
 from pipeline.storage.files import require_regular
 from pipeline.studies.plausibility.check import CONFIGURATION, FitState
-from pipeline.studies.plausibility.report import FitReport, fit_report
+from pipeline.studies.plausibility.fit import FitReport, fit_report
 from schemas.config import IngestConfig, StreamCorrection, settings_from, toml_of
 from schemas.errors import BaliseError, InputError, UsageError
 from schemas.frozen import frozen

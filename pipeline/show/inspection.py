@@ -22,7 +22,7 @@ from pipeline.storage import files
 from pipeline.storage.address import Address, redacted
 from pipeline.storage.described import PREFIX, describe
 from pipeline.storage.parquet import ParquetError
-from pipeline.studies.plausibility.report import FitReport, fit_report
+from pipeline.studies.plausibility.fit import FitReport, fit_report
 from schemas.config import Configuration, IngestConfig, Vehicle
 from schemas.errors import UsageError
 from schemas.run import Finding, Site

@@ -12,8 +12,7 @@ import numpy as np
 import polars as pl
 
 from pipeline.stages.alignment.align import align, odometer_at
-from pipeline.stages.epochs.monitored import MonitoredEpochs
-from pipeline.stages.epochs.verdicts import Verdicts
+from pipeline.stages.epochs.verdicts import MonitoredEpochs, Verdicts
 from pipeline.stages.evidence import TrainEvidence
 from pipeline.stages.judge.epochs import direction_by_evidence
 from pipeline.stages.judge.judgement import Solution

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 from collections.abc import Mapping
 from dataclasses import field, replace
 
@@ -22,15 +23,40 @@ from pipeline.stages.evidence.gathering import on_time, without_frozen
 from pipeline.stages.follows import NOT_TESTED, Follows, follows_positions
 from pipeline.stages.matching import Match, match
 from pipeline.stages.odometry import Odometry, counted_over_slip, odometry_of
-from pipeline.stages.provenance import Provenance, provenance
 from pipeline.stages.reference import reference_stretches
 from pipeline.stages.track.network import network_in_pieces, site_network
-from schemas.config import Configuration, Vehicle
+from schemas.config import Configuration, Vehicle, digest_of
 from schemas.enums import Remedy, VehicleFigures
 from schemas.errors import InputError
 from schemas.frozen import frozen
 from schemas.run import RunLog, Site
+from schemas.version import SOFTWARE
 from schemas.words import remedy_words
+
+
+@frozen
+class Provenance:
+    """The same provenance always gives the same tables; `calibrated_by`: runs that tell of vehicle and noise."""
+
+    config_digest: str
+    input_digest: str
+    software: str
+    calibrated_by: tuple[str, ...] = ()
+
+
+def provenance(run: RunLog, site: Site, vehicle: Vehicle, config: Configuration) -> Provenance:
+    """Which log, site, settings and program results are made of."""
+    return Provenance(
+        config_digest=digest_of(config, vehicle),
+        input_digest=input_digest(run, site.digest),
+        software=SOFTWARE,
+        calibrated_by=config.calibration.runs,
+    )
+
+
+def input_digest(run: RunLog, site_digest: str) -> str:
+    """What the `runs` table calls the input digest: SHA-256 over those of log and site."""
+    return hashlib.sha256(f"{run.input_digest}:{site_digest}".encode()).hexdigest()
 
 
 @frozen

@@ -14,7 +14,7 @@ _SCRIPT = """
 import resource
 from pathlib import Path
 import polars as pl
-from pipeline.studies.plausibility.report import fit_report
+from pipeline.studies.plausibility.fit import fit_report
 from schemas.config import Configuration, Vehicle
 from schemas.errors import BaliseError
 from tests.replay.journeys import QUIET, journey

@@ -15,7 +15,7 @@ from datasets.experiment.tables import Row
 from datasets.faults import FaultKind, FaultSpec
 from datasets.inject import inject
 from pipeline.stages.epochs.clock import reactions_ns
-from pipeline.stages.epochs.monitored import MonitoredEpochs
+from pipeline.stages.epochs.verdicts import MonitoredEpochs
 from pipeline.stages.judge.epochs import time_in_use
 from pipeline.stages.judge.judged import RIGHT, UNKNOWN, WRONG
 from pipeline.stages.monitored import MonitoredSolution, monitor_solution

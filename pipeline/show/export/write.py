@@ -10,7 +10,7 @@ from pipeline.results.store import check_site, completed_runs, read_run
 from pipeline.show.export.gis import run_geojson, run_gpx
 from pipeline.show.export.layers import geopackage_bytes, geoparquet_bytes, layers_of
 from pipeline.show.export.mcap_file import PositionMessage, run_topics, write_topics
-from pipeline.stages.provenance import input_digest
+from pipeline.stages.prepare import input_digest
 from pipeline.storage import write_bytes
 from schemas.errors import UsageError
 from schemas.run import RunLog, RunTables, Site

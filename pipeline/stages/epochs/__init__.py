@@ -4,5 +4,5 @@ In: times of epochs, flags on them, values of monitors. Out: shares of time, out
 Touches no file and knows no other package of the pipeline.
 
 How long, under which condition, and when a place is passed: `clock`. Value, threshold, state and reason of a monitor,
-first fails and alarm episodes: `verdicts`. All that the train itself knew of its epochs, in one class: `monitored`.
+first fails and alarm episodes, and all that the train itself knew of its epochs, in one class: `verdicts`.
 """

@@ -6,7 +6,7 @@ import numpy as np
 import polars as pl
 
 from pipeline.stages.epochs.clock import crossing_gaps_ns, nominal_period_s, periods_before_s, reactions_ns
-from pipeline.stages.epochs.monitored import MonitoredEpochs
+from pipeline.stages.epochs.verdicts import MonitoredEpochs
 from pipeline.stages.evidence import TrainEvidence, true_places
 from pipeline.stages.evidence.evidence import Span, within_spans
 from pipeline.stages.judge.judged import REFERENCE, RIGHT, WRONG, JudgedEpochs, JudgedOffers, Judgements

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import polars as pl
 
-from pipeline.stages.epochs.monitored import MonitoredEpochs
+from pipeline.stages.epochs.verdicts import MonitoredEpochs
 from pipeline.stages.evidence import TruePlaces
 from pipeline.stages.evidence.evidence import KINDS
 from schemas.arrays import Bools, Floats, Ints, Rows

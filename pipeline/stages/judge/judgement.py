@@ -10,7 +10,7 @@ from typing import Self
 import numpy as np
 import polars as pl
 
-from pipeline.stages.epochs.monitored import MonitoredEpochs
+from pipeline.stages.epochs.verdicts import MonitoredEpochs
 from pipeline.stages.evidence import TrainEvidence, either
 from pipeline.stages.evidence.carrying import Interval, carried_forward
 from pipeline.stages.evidence.evidence import NOTHING, Alternative, EvidenceSet, within_spans

@@ -20,7 +20,7 @@ from pipeline.stages.judge.judged import JudgedEpochs
 from pipeline.stages.matching.epochs import contradictory_covariances
 from pipeline.stages.monitored import MonitoredSolution
 from pipeline.stages.odometry import Odometry
-from pipeline.stages.provenance import Provenance
+from pipeline.stages.prepare import Provenance
 from pipeline.stages.run_row.lost_time import LostColumns, LostTime, in_use_of, lost_time, remedies
 from pipeline.stages.run_row.run_figures import (
     accuracy,

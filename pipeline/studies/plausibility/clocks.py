@@ -6,7 +6,6 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 from pipeline.read.ingest.timescale import leap_seconds
-from pipeline.studies.plausibility.causes import explain_lag
 from pipeline.studies.plausibility.check import (
     IN_VEHICLE_FILE,
     VEHICLE_FILE,
@@ -14,6 +13,7 @@ from pipeline.studies.plausibility.check import (
     Check,
     FitState,
     correction,
+    explain_lag,
     fits,
     misfit,
     not_checked,

@@ -11,7 +11,6 @@ import polars as pl
 
 from pipeline.stages.follows import Follows, follows_positions
 from pipeline.stages.odometry.rows import declared_origin
-from pipeline.studies.plausibility.causes import explain_factor
 from pipeline.studies.plausibility.check import (
     IN_VEHICLE_FILE,
     VEHICLE_FILE,
@@ -19,6 +18,7 @@ from pipeline.studies.plausibility.check import (
     Check,
     FitState,
     correction,
+    explain_factor,
     fits,
     misfit,
     not_checked,

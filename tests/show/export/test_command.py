@@ -12,7 +12,7 @@ from typer.testing import CliRunner
 from cli import app
 from datasets.trial import write_run_log, write_site
 from pipeline.show.export.write import export_run
-from pipeline.stages.provenance import input_digest, provenance
+from pipeline.stages.prepare import input_digest, provenance
 from schemas.config import Configuration, Vehicle
 from schemas.errors import UsageError
 from tests.show.export.conftest import Result

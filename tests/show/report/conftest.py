@@ -16,7 +16,7 @@ from datasets.trial import build_run, build_site
 from pipeline.one_run import replay
 from pipeline.results.store import write_config, write_run
 from pipeline.show.report import write_report
-from pipeline.stages.provenance import Provenance
+from pipeline.stages.prepare import Provenance
 from pipeline.stages.run_row.summary import failed_row
 from schemas.config import Configuration, Vehicle
 from schemas.run import RunTables, Site

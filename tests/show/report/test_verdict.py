@@ -11,7 +11,7 @@ from pipeline.results.store import write_run
 from pipeline.show.report import markup, write_report
 from pipeline.show.report.balises import balise_table
 from pipeline.show.report.markup import cell
-from pipeline.stages.provenance import Provenance
+from pipeline.stages.prepare import Provenance
 from pipeline.stages.run_row.summary import failed_row
 from schemas.campaign import CampaignBalises
 from schemas.run import RunTables

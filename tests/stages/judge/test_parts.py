@@ -10,8 +10,7 @@ import numpy as np
 import polars as pl
 import pytest
 
-from pipeline.stages.epochs.monitored import MonitoredEpochs
-from pipeline.stages.epochs.verdicts import AlarmEpisode, FailureLog
+from pipeline.stages.epochs.verdicts import AlarmEpisode, FailureLog, MonitoredEpochs
 from pipeline.stages.evidence.evidence import KINDS, NOTHING, Alternative, EvidenceSet
 from pipeline.stages.judge.episodes import (
     Detection,

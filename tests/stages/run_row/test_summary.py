@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 
 from pipeline.stages.judge.judge import Judged
 from pipeline.stages.judge.judged import JudgedEpochs
-from pipeline.stages.provenance import Provenance
+from pipeline.stages.prepare import Provenance
 from pipeline.stages.run_row.lost_time import lost_columns
 from pipeline.stages.run_row.summary import SolutionResults, failed_row, summarise
 from schemas.config import Configuration, LdsConfig

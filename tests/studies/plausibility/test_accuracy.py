@@ -9,7 +9,7 @@ import polars as pl
 import pytest
 
 from pipeline.stages.judge.judged import JudgedEpochs
-from pipeline.studies.plausibility.report import accuracy_checks, refuted
+from pipeline.studies.plausibility.fit import accuracy_checks, refuted
 from schemas.config import Configuration
 from schemas.enums import MisfitCause
 from tests.arrays_of_table import arrays_of_table

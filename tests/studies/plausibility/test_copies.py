@@ -10,7 +10,7 @@ import pytest
 
 from datasets.random_trials import random_trial
 from pipeline.one_run import replay as replayed
-from pipeline.studies.plausibility.copies import copy_check
+from pipeline.studies.plausibility.places import copy_check
 from pipeline.studies.plausibility.recording import recording_of
 from schemas.config import Configuration, PlausibilityConfig, Vehicle
 from schemas.errors import InputError

@@ -15,10 +15,8 @@ from pipeline.one_run import replay as replayed
 from pipeline.read.ingest.correct import corrected
 from pipeline.stages.clean.clean import clean
 from pipeline.studies.calibration.calibrate import calibrate
-from pipeline.studies.plausibility.causes import explain_factor, explain_lag
-from pipeline.studies.plausibility.check import CONFIGURATION, Cause, FitState
-from pipeline.studies.plausibility.fit import Fit, fit_run, lines_of
-from pipeline.studies.plausibility.report import fit_report
+from pipeline.studies.plausibility.check import CONFIGURATION, Cause, FitState, explain_factor, explain_lag
+from pipeline.studies.plausibility.fit import Fit, fit_report, fit_run, lines_of
 from schemas.config import Configuration, IngestConfig, PlausibilityConfig, Vehicle, settings_from
 from schemas.enums import MisfitCause
 from schemas.errors import ConfigError, InputError

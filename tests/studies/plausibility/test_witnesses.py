@@ -7,8 +7,8 @@ import pytest
 
 from pipeline.stages.clean.clean import clean
 from pipeline.studies.plausibility.check import FitState
+from pipeline.studies.plausibility.fit import ODOMETERS, fit_report
 from pipeline.studies.plausibility.odometer import follows_checks
-from pipeline.studies.plausibility.report import ODOMETERS, fit_report
 from schemas.config import Configuration, Vehicle
 from schemas.enums import Origin
 from schemas.run import RunLog
