@@ -13,7 +13,7 @@ from datasets.demo import demo_scenario
 from datasets.trial import build_run, build_site, write_run_log, write_site
 from pipeline.campaign import make_plan, run_campaign
 from pipeline.campaign.compact import compact
-from pipeline.campaign.finish import write_campaign as write_tables
+from pipeline.campaign.run import write_campaign as write_tables
 from pipeline.results.query import run_sql
 from schemas.config import Configuration
 from schemas.enums import RunStatus

@@ -10,8 +10,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
-from pipeline.campaign.ground import site_of
-from pipeline.campaign.plan import Plan, RunJob, find_runs
+from pipeline.campaign.plan import Plan, RunJob, find_runs, site_of
 from pipeline.campaign.recorded_log import RecordedLog
 from pipeline.read.site.route import with_route
 from pipeline.results.workers import mapped

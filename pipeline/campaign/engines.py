@@ -20,10 +20,9 @@ from tempfile import TemporaryDirectory
 from types import FrameType
 from typing import Any
 
-from pipeline.campaign.ground import held, hold
 from pipeline.campaign.interruption import StopRun, answered
 from pipeline.campaign.outcome import NO_MEMORY, Result, RunFailure, overdue
-from pipeline.campaign.plan import RunJob
+from pipeline.campaign.plan import RunJob, held, hold
 from pipeline.campaign.waits import WAITS
 from pipeline.campaign.worker import fail_run, replay_one
 from pipeline.results.workers import single_threaded_children

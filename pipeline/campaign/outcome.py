@@ -11,8 +11,7 @@ import polars as pl
 
 from pipeline.campaign.plan import RunJob
 from pipeline.results.figures.hazard_words import hazard_words
-from pipeline.results.figures.head import worst_verdict
-from pipeline.results.figures.known_counts import HAZARD_COUNTS, known_counts
+from pipeline.results.figures.head import HAZARD_COUNTS, known_counts, worst_verdict
 from pipeline.results.outcome import VERDICT_FIGURES, RunOutcome
 from pipeline.stages.prepare import Provenance
 from pipeline.storage.address import Address, redacted

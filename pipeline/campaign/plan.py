@@ -7,18 +7,44 @@ from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import field, replace
 
 from pipeline import storage
-from pipeline.campaign.ground import hold
 from pipeline.read.site.read import read_site, refuse_unrelated
 from pipeline.results import store
 from pipeline.results.manifest import SettingsFiles, listing, settings_files, unaltered
 from pipeline.results.software import software_digest
 from pipeline.storage import files
 from pipeline.storage.address import Address, join, name_of, redacted, stem_of
-from schemas.config import Configuration, Vehicle, digest_of
-from schemas.errors import InputError, UsageError
+from schemas.config import Configuration, SiteConfig, Vehicle, digest_of
+from schemas.errors import InputError, SiteError, UsageError
 from schemas.frozen import frozen
-from schemas.run import STREAMS
+from schemas.run import STREAMS, Site
 from schemas.version import SOFTWARE
+
+# At most one, by digest of its files and configuration: the same content is the same site, wherever it lies.
+_held: dict[tuple[str, SiteConfig], Site] = {}
+
+
+def hold(site: Site, config: SiteConfig) -> None:
+    """Keep the site of this process, so that no run reads it again."""
+    _held.clear()
+    _held[site.digest, config] = site
+
+
+def held() -> list[tuple[Site, SiteConfig]]:
+    """What a new worker is to hold."""
+    return [(site, config) for (_, config), site in _held.items()]
+
+
+def site_of(address: str, digest: str, config: SiteConfig) -> Site:
+    """The site of this digest, read where this process does not hold it. Raises `SiteError` where it has changed."""
+    if (digest, config) not in _held:
+        storage.reach(address)  # or a worker that the store does not answer would end the campaign, not fail its run
+        site = read_site(address, config)
+        if site.digest != digest:
+            remedy = "Start the campaign again."
+            raise SiteError("has changed since the campaign began", place=redacted(address), remedy=remedy)
+        hold(site, config)
+    return _held[digest, config]
+
 
 _NULL_OF_HIVE = "__HIVE_DEFAULT_PARTITION__"
 

@@ -14,10 +14,9 @@ import polars as pl
 
 from pipeline import storage
 from pipeline.campaign import lock, resume
-from pipeline.campaign.finish import campaign_files, campaign_key
 from pipeline.campaign.outcome import outcome_of
 from pipeline.campaign.plan import RunJob, make_plan
-from pipeline.campaign.run import run_campaign
+from pipeline.campaign.run import campaign_files, campaign_key, run_campaign
 from pipeline.campaign.watch import Follower
 from pipeline.results import catalogue, packs, store
 from pipeline.results.manifest import NAME, Manifest, anchor, earlier, gathered, read_manifest

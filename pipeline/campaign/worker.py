@@ -10,7 +10,6 @@ import polars as pl
 
 from pipeline import storage
 from pipeline.campaign import lock
-from pipeline.campaign.ground import site_of
 from pipeline.campaign.interruption import ENDING
 from pipeline.campaign.outcome import (
     RunFailure,
@@ -19,7 +18,7 @@ from pipeline.campaign.outcome import (
     outcome_of,
     worst,
 )
-from pipeline.campaign.plan import RunJob, digests
+from pipeline.campaign.plan import RunJob, digests, site_of
 from pipeline.campaign.recorded_log import RecordedLog
 from pipeline.campaign.resume import proof_of
 from pipeline.read.site.route import with_route

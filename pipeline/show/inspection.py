@@ -14,8 +14,7 @@ from pipeline.read.ingest.describe import LogDescription, StreamSummary, TopicSu
 from pipeline.read.ingest.parts import LogPart, parts_of_table_by
 from pipeline.read.site.read import read_site
 from pipeline.results import store
-from pipeline.results.figures.head import head_of, run_verdicts
-from pipeline.results.figures.known_counts import HAZARD_COUNTS, known_counts
+from pipeline.results.figures.head import HAZARD_COUNTS, head_of, known_counts, run_verdicts
 from pipeline.show.kinds import Kind, kind_at
 from pipeline.show.terminal import show_tables
 from pipeline.storage import files

@@ -107,7 +107,7 @@ def test_stop_on_request_at_the_very_end(
 
     plan = plan_of(small_trial, tmp_path, small_trial.paths[:1])
     with monkeypatch.context() as patched:
-        patched.setattr("pipeline.campaign.finish.write_campaign", slow)
+        patched.setattr("pipeline.campaign.run.write_campaign", slow)
         with pytest.raises(Interrupted) as caught:
             run_campaign(plan)
     assert caught.value.signum == signum

@@ -47,7 +47,7 @@ def test_nothing_is_opened_where_nothing_changed(
     for place in ("pipeline.results.marker.metadata_of", f"{store.__name__}.read_table"):
         monkeypatch.setattr(place, never)
     monkeypatch.setattr(storage, "file_digests", never)
-    monkeypatch.setattr("pipeline.campaign.finish.write_campaign", lambda *_: None)
+    monkeypatch.setattr("pipeline.campaign.run.write_campaign", lambda *_: None)
     (known,) = run_campaign(plan).outcomes
     assert (known.skipped, known.run_id, known.verdict) == (True, "run0", whole.verdict)
 

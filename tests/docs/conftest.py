@@ -13,7 +13,7 @@ import pytest
 from datasets.scenario import RunSpec, Scenario, load_scenario
 from datasets.trial import build_run, build_site, write_run_log, write_site
 from pipeline.campaign import make_plan
-from pipeline.campaign.finish import write_campaign
+from pipeline.campaign.run import write_campaign
 from pipeline.campaign.worker import replay_one
 from pipeline.results.store import write_config
 from schemas.config import Configuration, to_toml

@@ -14,7 +14,7 @@ import pyarrow.parquet as pq
 import pytest
 
 from pipeline.campaign import make_plan, run_campaign
-from pipeline.campaign.finish import write_campaign
+from pipeline.campaign.run import write_campaign
 from pipeline.campaign.verify import recompute, verify
 from pipeline.results.manifest import note_pages, settings_files
 from pipeline.results.store import table_address

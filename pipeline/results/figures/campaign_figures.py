@@ -13,10 +13,10 @@ from pipeline.results.figures.campaign_tables import (
     campaign_levels,
     campaign_runs,
     counted_runs,
+    spacing_of_runs,
     with_truth,
 )
 from pipeline.results.figures.map_errors import map_places
-from pipeline.results.figures.undetected import spacing_of_runs
 from pipeline.stages.run_row.bounds import (
     DETECTION_TIMES,
     Estimator,

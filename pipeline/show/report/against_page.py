@@ -7,8 +7,7 @@ from typing import Any
 
 import polars as pl
 
-from pipeline.results.figures.head import head_of, run_verdicts, verdict_figures, word_of
-from pipeline.results.figures.known_counts import HAZARD_COUNTS, known_counts
+from pipeline.results.figures.head import HAZARD_COUNTS, head_of, known_counts, run_verdicts, verdict_figures, word_of
 from pipeline.results.query import run_sql
 from pipeline.results.store import read_config, read_table
 from pipeline.show.report.columns import frame_table, title

@@ -9,8 +9,7 @@ from html import escape
 import polars as pl
 
 from pipeline.results.figures.campaign_figures import failures_of
-from pipeline.results.figures.head import head_of, run_verdicts, word_of
-from pipeline.results.figures.known_counts import HAZARD_COUNTS, known_counts
+from pipeline.results.figures.head import HAZARD_COUNTS, head_of, known_counts, run_verdicts, word_of
 from pipeline.results.places import origin_of
 from pipeline.show.report.balises import architectures_section, balise_table, lost_shares, outcome
 from pipeline.show.report.columns import Row, figures, frame_table

@@ -10,7 +10,7 @@ from urllib.parse import quote
 import polars as pl
 
 from pipeline.results.figures.campaign_tables import campaign_balises, with_truth
-from pipeline.results.figures.known_counts import known_counts
+from pipeline.results.figures.head import known_counts
 from pipeline.results.places import origin_of
 from pipeline.show.report.balises import architectures_section, balise_table, lost_shares, outcome
 from pipeline.show.report.columns import Row, figures, frame_table

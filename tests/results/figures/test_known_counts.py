@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from pipeline.campaign.outcome import outcome_of
-from pipeline.results.figures.known_counts import known_counts
+from pipeline.results.figures.head import known_counts
 from pipeline.results.store import write_run
 from pipeline.show.inspection import inspect_result
 from schemas.run import RunTables

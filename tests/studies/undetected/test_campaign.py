@@ -7,7 +7,7 @@ from typing import Any
 import polars as pl
 import pytest
 
-from pipeline.results.figures.undetected import spacing_of_runs, undetected_spread
+from pipeline.results.figures.campaign_tables import spacing_of_runs, undetected_spread
 from pipeline.stages.judge.judged import JudgedEpochs
 from pipeline.studies.undetected.columns import Undetected
 from pipeline.studies.undetected.figures import Spacing, undetected_figures
