@@ -14,7 +14,7 @@ from pipeline.stages.matching import Match
 from pipeline.stages.monitored import MonitoredSolution, monitor_solution
 from pipeline.stages.prepare import PreparedRun, prepare
 from pipeline.stages.run_row.lost_time import lost_columns
-from pipeline.stages.run_row.summary import SolutionResults, failed_row, notes_of_replay, summarise
+from pipeline.stages.run_row.summary import SolutionResults, failed_row, replay_notes, summarise
 from pipeline.studies.plausibility.fit import Fit, accuracy_checks, clock_advice, refuted, required_fit, with_checks
 from pipeline.studies.undetected.columns import Undetected, unnoticed_of
 from schemas.config import Configuration, Vehicle
@@ -197,7 +197,7 @@ def _results(
         undetected=unnoticed.epochs,
         columns=columns,
         ingest=run.notes,
-        notes=[*fit.notes, *notes_of_replay(monitored, evidence)],
+        notes=[*fit.notes, *replay_notes(monitored, evidence)],
         reasons=[reason for reason, applies in against.items() if applies],
         anchored_ns=evidence.anchored_ns,
         clock_open_s=evidence.clock_open_s,

@@ -10,7 +10,7 @@ import polars as pl
 
 from pipeline.results.manifest import NAME
 from pipeline.show.terminal import show_tables, tall, to_json
-from pipeline.stages.run_row.bounds import bounds_of
+from pipeline.stages.run_row.bounds import bound_columns
 from pipeline.studies.safety.assessment import SOURCES, Assessment
 from pipeline.studies.safety.budget import published
 from schemas.campaign import CampaignFigures
@@ -69,7 +69,7 @@ def figures_for_reading(figures: pl.DataFrame) -> dict[str, pl.DataFrame]:
 
 
 def _figures(row: Mapping[str, Any]) -> pl.DataFrame:
-    bounds = bounds_of(row)
+    bounds = bound_columns(row)
     not_shown = {"solution", *(name for name in row if re.search("_(low|high)(_|$)", name))}
     rows = [
         (name, value, *(row.get(bound) for bound in bounds.get(name, ("", ""))), *_unit_and_source(name))

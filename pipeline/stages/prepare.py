@@ -12,10 +12,10 @@ from pipeline.stages.clean import CleanCounts
 from pipeline.stages.clean.clean import (
     ClockAdvice,
     clean,
-    no_advice,
-    of_the_journey,
     require_one_journey,
     require_two_times,
+    without_advice,
+    without_undated_streams,
 )
 from pipeline.stages.evidence import TrainEvidence, evidence_of
 from pipeline.stages.evidence.anchors import read_anchors
@@ -133,7 +133,7 @@ class PreparedRun:
 
 
 def prepare(
-    run: RunLog, site: Site, vehicle: Vehicle, config: Configuration, clock_advice: ClockAdvice = no_advice
+    run: RunLog, site: Site, vehicle: Vehicle, config: Configuration, clock_advice: ClockAdvice = without_advice
 ) -> PreparedRun:
     """Put the streams of a run in order, make its odometers, and test whether they are made of the positions.
 
@@ -151,7 +151,7 @@ def prepare(
         InputError: nothing can be replayed: no two times, none in common, longer than a journey.
     """
     recorded, counts = clean(run, config, clock_advice)
-    journey = of_the_journey(recorded)
+    journey = without_undated_streams(recorded)
     sensors = () if journey.odometer is None else (journey.odometer, *journey.other_odometers)
     found = [_follows(sensor, journey, config) for sensor in sensors]
     odometers = tuple(

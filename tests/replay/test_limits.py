@@ -13,7 +13,7 @@ import schemas.config_judge
 from pipeline import one_run
 from pipeline.results.places import stretches_of
 from pipeline.stages.evidence.carrying import carried_forward
-from pipeline.stages.judge.judgement import margins_m
+from pipeline.stages.judge.judgement import healthy_margins_m
 from pipeline.stages.run_row.lost_time import LostTime, remedies
 from pipeline.studies.line.spans import SpanState, spans_of, states_of
 from schemas.arrays import NS_PER_S
@@ -118,9 +118,9 @@ def test_a_limit_moves_what_its_name_says(limit: str, changed: Changed) -> None:
 def test_the_margin_of_a_healthy_position_is_no_wider(changed: Changed) -> None:
     """Three sigma of 5, 15 and 30 m, at most the limit."""
     sigma_m = np.array([5.0, 15.0, 30.0])
-    assert margins_m(sigma_m, HazardConfig()).tolist() == [15.0, 20.0, 20.0]
+    assert healthy_margins_m(sigma_m, HazardConfig()).tolist() == [15.0, 20.0, 20.0]
     changed("healthy_m", 2.0)
-    assert margins_m(sigma_m, HazardConfig()).tolist() == [15.0, 40.0, 40.0]
+    assert healthy_margins_m(sigma_m, HazardConfig()).tolist() == [15.0, 40.0, 40.0]
 
 
 def test_an_accepted_balise_that_the_one_before_contradicts_is_no_anchor(changed: Changed) -> None:

@@ -18,7 +18,7 @@ from pipeline.read.ingest.mcap_run import LARGEST_MESSAGE, walk_log
 from pipeline.read.ingest.plan import Sample, sources_of
 from pipeline.read.ingest.recipes import recipes_for
 from pipeline.read.ingest.run import read_run
-from pipeline.stages.clean.clean import StreamCounts, stamp_counts
+from pipeline.stages.clean.clean import StreamCounts, count_stamps
 from pipeline.stages.epochs.clock import GAP_PERIODS
 from pipeline.storage import files
 from pipeline.storage.address import Address, join, name_of
@@ -131,7 +131,7 @@ def _summary(stream: Stream, frame: pl.DataFrame) -> StreamSummary:
     t_ns = frame.to_series(0).to_physical().drop_nulls().to_numpy()
     ordered = np.diff(np.unique(t_ns))
     step = float(np.median(ordered)) if len(ordered) else None
-    stamps = stamp_counts(stream, frame) if stream != "faults" else StreamCounts()
+    stamps = count_stamps(stream, frame) if stream != "faults" else StreamCounts()
     late = ordered[ordered > GAP_PERIODS * step] if step else ordered[:0]
     mix = frame["fix"].value_counts().sort("fix") if stream == "gnss" else None
     return StreamSummary(

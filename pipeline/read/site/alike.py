@@ -9,7 +9,7 @@ from typing import NamedTuple
 import numpy as np
 import polars as pl
 
-from pipeline.stages.lds.crossings import DEFAULTS, minimal_spacing_m, window_m
+from pipeline.stages.lds.crossings import DEFAULTS, expectation_window, minimal_spacing_m
 from pipeline.stages.paths.candidates import candidates_of, search_about
 from pipeline.stages.paths.path_tests import offset_resolution_m, switch_resolution_m
 from pipeline.stages.track.geodesy import points_of
@@ -127,8 +127,8 @@ def _judge(reference: _Point, near: _OnChain, far: _OnChain, config: LdsConfig) 
     """A warning if the expectation windows of two balises on a chain overlap."""
     (expected, distance_m) = near
     (later, later_m) = far
-    close_m = window_m(distance_m, expected.accuracy_m, reference.accuracy_m, config).close_m
-    open_m = window_m(later_m, later.accuracy_m, reference.accuracy_m, config).open_m
+    close_m = expectation_window(distance_m, expected.accuracy_m, reference.accuracy_m, config).close_m
+    open_m = expectation_window(later_m, later.accuracy_m, reference.accuracy_m, config).open_m
     if open_m > close_m:
         return None
     needed_m = minimal_spacing_m(distance_m, expected.accuracy_m, later.accuracy_m, reference.accuracy_m, config)

@@ -21,15 +21,15 @@ from pipeline.stages.run_row.bounds import (
     DETECTION_TIMES,
     Estimator,
     clopper_pearson,
-    continuity_15s,
+    continuity_estimate,
     hours_still_needed,
     hours_to_substantiate,
     independent_episodes,
-    mtbf,
+    mtbf_estimate,
     poisson_rate,
     poisson_rate_upper,
     with_estimates,
-    without_copies,
+    without_repeated_runs,
 )
 from schemas.campaign import STANFORD, CampaignDetection, CampaignFigures
 from schemas.config import Configuration, SafetyConfig
@@ -41,8 +41,8 @@ _ROUNDING = 1e-9
 _ESTIMATES: tuple[Estimator, ...] = (
     *RATES,
     ("false_alarm_rate", "_per_h", poisson_rate, "false_alarms", "hours_judged"),
-    ("mtbf", "_h", mtbf, "trusted_losses", "trusted_h"),
-    ("continuity_15s", "", continuity_15s, "trusted_losses", "trusted_h"),
+    ("mtbf", "_h", mtbf_estimate, "trusted_losses", "trusted_h"),
+    ("continuity_15s", "", continuity_estimate, "trusted_losses", "trusted_h"),
 )
 _NAMES = {
     "hazards": "faults",
@@ -198,7 +198,7 @@ def derived_tables(
 
     What has bounds over runs counts no recording twice.
     """
-    once = without_copies(runs)
+    once = without_repeated_runs(runs)
     of_once = hazards.join(once, on=["run_id", "solution"], how="semi")
     passed = with_truth(passages.join(once, on=["run_id", "solution"], how="semi"), once)
     levels = campaign_levels(runs, config)

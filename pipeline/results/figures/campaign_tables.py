@@ -18,12 +18,12 @@ from pipeline.stages.run_row.bounds import (
 )
 from pipeline.stages.run_row.run_figures import (
     DECISIVE,
-    acceptances,
-    accepted,
+    acceptance_conditions,
+    error_spread,
+    is_accepted,
     is_passage,
     level_rows,
-    outcomes,
-    spread,
+    outcome_conditions,
 )
 from schemas.campaign import CampaignAccuracy, CampaignBalises, CampaignLevels, campaign_runs_schema
 from schemas.config import Configuration
@@ -160,20 +160,20 @@ def with_truth(passages: pl.DataFrame, runs: pl.DataFrame) -> pl.DataFrame:
 
 def _spread() -> dict[str, pl.Expr]:
     """Spread of the location errors [m] of acceptances."""
-    error = pl.col("location_error_m").filter(accepted())
-    return {**spread(error, "location_error", "count"), "location_error_sigma_m": error.std()}
+    error = pl.col("location_error_m").filter(is_accepted())
+    return {**error_spread(error, "location_error", "count"), "location_error_sigma_m": error.std()}
 
 
 def _counts() -> dict[str, pl.Expr]:
     """Conditions on passages (`with_truth`): in how many rows each holds."""
     mode = pl.col("failure_mode")
     passage = is_passage()
-    judged = acceptances()
+    judged = acceptance_conditions()
     counts = {
-        **outcomes(),
+        **outcome_conditions(),
         **judged,
         "passages": passage,
-        "accepted_passages": accepted() & passage,
+        "accepted_passages": is_accepted() & passage,
         "deletions": (mode == FailureMode.DELETION) & passage,
         "insertions": mode == FailureMode.INSERTION,
         "linking_errors": pl.col("linking_error") != LinkingError.NONE,
@@ -221,7 +221,7 @@ def campaign_accuracy(passages: pl.DataFrame, config: Configuration) -> pl.DataF
     Each acceptance whose error is known to 5 m is held against the location accuracy of its own balise. Bands of
     40 km/h from 0.
     """
-    known = (pl.col("kind") == BaliseKind.VIRTUAL) & accepted() & pl.col("location_error_m").is_not_null()
+    known = (pl.col("kind") == BaliseKind.VIRTUAL) & is_accepted() & pl.col("location_error_m").is_not_null()
     values = ("solution", "status", "location_error_m", "location_accuracy_m")
     groups = {"all": pl.lit(""), "netelement_id": pl.col("netelement_id"), "speed_band_kmh": _speed_band()}
     grouped = (

@@ -10,7 +10,7 @@ import polars as pl
 
 from pipeline.show.report.markup import UNKNOWN, Cell, cell, number, table
 from pipeline.show.report.words import OPINIONS, TITLES, WORDS
-from pipeline.stages.run_row.bounds import bounds_of
+from pipeline.stages.run_row.bounds import bound_columns
 
 Row = Mapping[str, Any]
 Special = Mapping[str, Callable[[Row], Cell]]
@@ -39,7 +39,7 @@ def frame_table(
     """A frame as a table; `names`: all columns unless said otherwise. Bounds are next to their figure."""
     special = special or {}
     shown = list(names) or _figure_names(frame.columns)
-    bounds = bounds_of(frame.columns)
+    bounds = bound_columns(frame.columns)
     meanings = _meanings(contract)
     rows = [
         [special[name](row) if name in special else _cell(row, name, bounds.get(name)) for name in shown]
@@ -53,7 +53,7 @@ def figures(identity: str, caption: str, row: Row, contract: type[dy.Schema]) ->
     it means.
     """
     meanings = _meanings(contract)
-    bounds = bounds_of(row)
+    bounds = bound_columns(row)
     rows = [
         [Cell(name, name), Cell(_text(row, name, bounds.get(name))), Cell(meanings[name], meanings[name])]
         for name in _figure_names(row)
@@ -63,7 +63,7 @@ def figures(identity: str, caption: str, row: Row, contract: type[dy.Schema]) ->
 
 def _figure_names(names: Collection[str]) -> list[str]:
     """The columns that are no bounds of others."""
-    bounds = {bound for pair in bounds_of(names).values() for bound in pair}
+    bounds = {bound for pair in bound_columns(names).values() for bound in pair}
     return [name for name in names if name not in bounds]
 
 

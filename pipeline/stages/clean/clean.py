@@ -1,4 +1,4 @@
-"""The gate before any computation: can a stream be of one journey, by its times alone?
+"""Streams in order of time, each stamp once, without strays and placeholders; refused where they are of no one journey.
 
 Behind it no array that follows a stream's span is larger than the gate allows.
 """
@@ -26,7 +26,7 @@ _NS_PER_H = 3_600 * NS_PER_S
 
 
 def require_two_times(stream: pl.DataFrame, place: str, of: str = "") -> None:
-    """Refuse a stream (unique times) of fewer than two rows; `of`: words that say whose it is."""
+    """Refuse a stream (unique times) of fewer than two rows; `of`: words that say whose it is, for the message."""
     if stream.height < 2:
         raise InputError(
             f"all rows have the same time{of}" if stream.height else f"no row has a time after 1970{of}",
@@ -38,7 +38,7 @@ def require_two_times(stream: pl.DataFrame, place: str, of: str = "") -> None:
 
 
 def require_one_journey(fixes: pl.DataFrame, place: str, config: IngestConfig) -> None:
-    """Refuse a solution with a gap of more than a day, or one that lasts too long."""
+    """Refuse a solution with a gap of more than a day, or one that lasts longer than a journey."""
     gaps = np.diff(times_ns(fixes)) > DAY_NS
     if gaps.any():
         row = int(gaps.argmax())
@@ -53,7 +53,7 @@ def require_one_journey(fixes: pl.DataFrame, place: str, config: IngestConfig) -
 
 
 def require_spans(run: RunLog, config: IngestConfig) -> None:
-    """Refuse streams other than the positions that last too long; of positions each solution is asked."""
+    """Refuse streams, other than the positions, that last longer than a journey; each solution is asked for itself."""
     odometers = [("odometer", odometer) for odometer in (run.odometer, *run.other_odometers)]
     satellites = [] if run.satellites is None else run.satellites.partition_by("solution", maintain_order=True)
     others = [(name, run.stream(name)) for name in _OF_POSITIONS if name != "satellites"]
@@ -91,8 +91,8 @@ ClockAdvice = Callable[[RunLog], str]
 """What moves recorders of different times to one journey, in a sentence; empty where nothing does."""
 
 
-def no_advice(run: RunLog) -> str:
-    """No sentence of help for recorders without a time in common."""
+def without_advice(run: RunLog) -> str:
+    """No sentence of help, for recorders without a time in common."""
     return ""
 
 
@@ -123,7 +123,7 @@ class CleanCounts:
 def clean(
     run: RunLog,
     config: Configuration = Configuration(),  # noqa: B008 - frozen
-    clock_advice: ClockAdvice = no_advice,
+    clock_advice: ClockAdvice = without_advice,
 ) -> tuple[RunLog, CleanCounts]:
     """The run with every stream in order and each stamp once (the first recorded one stays).
 
@@ -142,34 +142,37 @@ def clean(
     Raises:
         InputError: nothing can be replayed: no two times, none in common, longer than a journey.
     """
-    dated = _dated_streams(run, config.ingest.wrong_dates_share)
+    dated = _part_strays(run, config.ingest.wrong_dates_share)
     streams: dict[str, pl.DataFrame] = {}
     counts: dict[str, StreamCounts] = {}
     for name, (kept, strays) in dated.items():
-        streams[name], ordering = _in_order(kept, _KEYS.get(name, ["t"]))
+        streams[name], ordering = _sort_rows(kept, _KEYS.get(name, ["t"]))
         counts[name] = replace(ordering, far_off=strays.height)
     others: tuple[pl.DataFrame, ...] = ()
     if "odometer" in streams:
-        streams["odometer"], others = _by_sensor(streams["odometer"], config.lds.odometer_sensor, run.run_id)
-    streams["gnss"], placeholders = _with_fixes(streams["gnss"], config)
-    streams["gnss"], held = _without_copies(streams["gnss"])
-    cleaned = replace(run, notes=_noted(run.notes, counts), other_odometers=others or run.other_odometers)
+        streams["odometer"], others = _part_sensors(streams["odometer"], config.lds.odometer_sensor, run.run_id)
+    streams["gnss"], placeholders = _without_placeholders(streams["gnss"], config)
+    streams["gnss"], held = _without_held_positions(streams["gnss"])
+    cleaned = replace(run, notes=_note_left_out(run.notes, counts), other_odometers=others or run.other_odometers)
     cleaned = cleaned.with_streams(**streams)
     require_spans(cleaned, config.ingest)
     _require_times(cleaned, clock_advice)
     return cleaned, CleanCounts(_solution_counts(*dated["gnss"], placeholders, held), counts)
 
 
-def _dated_streams(run: RunLog, few: float) -> dict[Stream, tuple[pl.DataFrame, pl.DataFrame]]:
-    """Each stream without its strays, and these; positions decide for the others, so GNSS comes first."""
+def _part_strays(run: RunLog, few: float) -> dict[Stream, tuple[pl.DataFrame, pl.DataFrame]]:
+    """Each stream without its strays, and the strays; positions decide for the others, so GNSS comes first.
+
+    `few`: the largest share of rows that may be strays.
+    """
     dated: dict[Stream, tuple[pl.DataFrame, pl.DataFrame]] = {}
     for name in STREAMS:
         frame = run.stream(name)
         if frame is None or name == "faults":
             continue
-        stray = _strays(frame, few)
+        stray = _are_strays(frame, few)
         if name in _OF_POSITIONS:
-            elsewhere = _far_from_any(frame["t"], dated["gnss"][0]["t"])
+            elsewhere = _are_far_from_all(frame["t"], dated["gnss"][0]["t"])
             # Where no row is near, the clock of the whole recorder is wrong: the fit of the run names it.
             stray |= elsewhere & (not elsewhere.all())
         dated[name] = (frame.filter(~stray) if stray.any() else frame), frame.filter(stray)
@@ -184,7 +187,7 @@ def _solution_counts(
     for part in recorded.select("solution", "t", *_PLACE).partition_by("solution", maintain_order=True):
         name = part["solution"][0]
         marked = {"placeholders": placeholders.get(name, 0), "held": held.get(name, 0)}
-        counts[name] = replace(_of_solution(part, far), **marked)
+        counts[name] = replace(_count_solution(part, far), **marked)
     return counts
 
 
@@ -199,15 +202,14 @@ def _require_times(run: RunLog, clock_advice: ClockAdvice) -> None:
         _require_common_time(run, clock_advice)
 
 
-def of_the_journey(run: RunLog) -> RunLog:
-    """The run without the streams of which no row lies within a day of a position; `notes` say so.
-
-    Their clocks are wrong: what is judged must not carry anything over years.
-    """
+def without_undated_streams(run: RunLog) -> RunLog:
+    """The run without the streams of which no row lies within a day of a position; `notes` say so."""
     away = [
         name
         for name in _OF_POSITIONS
-        if (frame := run.stream(name)) is not None and frame.height and _far_from_any(frame["t"], run.gnss["t"]).all()
+        if (frame := run.stream(name)) is not None
+        and frame.height
+        and _are_far_from_all(frame["t"], run.gnss["t"]).all()
     ]
     if not away:
         return run
@@ -216,7 +218,7 @@ def of_the_journey(run: RunLog) -> RunLog:
     return replace(run, notes=notes).with_streams(**dict.fromkeys(away))
 
 
-def _by_sensor(odometer: pl.DataFrame, used: str, run_id: str) -> tuple[pl.DataFrame, tuple[pl.DataFrame, ...]]:
+def _part_sensors(odometer: pl.DataFrame, used: str, run_id: str) -> tuple[pl.DataFrame, tuple[pl.DataFrame, ...]]:
     """The odometer that the LDS uses, and the others in the order of their names."""
     if "sensor" not in odometer.columns:
         return odometer, ()
@@ -232,21 +234,21 @@ def _by_sensor(odometer: pl.DataFrame, used: str, run_id: str) -> tuple[pl.DataF
     return sensors.pop(used, odometer), tuple(sensors[name] for name in sorted(sensors))
 
 
-def _with_fixes(gnss: pl.DataFrame, config: Configuration) -> tuple[pl.DataFrame, dict[str, int]]:
-    """Positions without placeholders, and how many these were, by solution."""
+def _without_placeholders(gnss: pl.DataFrame, config: Configuration) -> tuple[pl.DataFrame, dict[str, int]]:
+    """Positions with placeholders marked as epochs without a fix, and how many these are, by solution."""
     if not {"fix", *_PLACE} <= set(gnss.columns):
         return gnss, {}
     counts: dict[str, int] = {}
     marked: list[pl.DataFrame] = []
     narrow = gnss.select("solution", "t", "fix", *_PLACE).with_row_index("_row")
     for part in narrow.partition_by("solution", maintain_order=True):
-        part, count = without_placeholders(part, config.ingest, config.align.fastest_mps)
+        part, count = mark_placeholders(part, config.ingest, config.align.fastest_mps)
         marked.append(part.select("_row", "fix"))
         counts[part["solution"][0]] = count
     return (gnss.with_columns(pl.concat(marked).sort("_row")["fix"]) if any(counts.values()) else gnss), counts
 
 
-def _without_copies(gnss: pl.DataFrame) -> tuple[pl.DataFrame, dict[str, int]]:
+def _without_held_positions(gnss: pl.DataFrame) -> tuple[pl.DataFrame, dict[str, int]]:
     """Positions without rows that repeat them at a higher rate than the receiver's, and how many, by solution."""
     if not {"solution", *_PLACE} <= set(gnss.columns):
         return gnss, {}
@@ -256,14 +258,14 @@ def _without_copies(gnss: pl.DataFrame) -> tuple[pl.DataFrame, dict[str, int]]:
     for part in narrow.partition_by("solution", maintain_order=True):
         t_ns = times_ns(part)
         places = (part[name].cast(pl.Float64).fill_null(float("nan")).to_numpy() for name in _PLACE)
-        held = copies((t_ns - t_ns[:1]) / 1e9, *places)
+        held = held_positions((t_ns - t_ns[:1]) / 1e9, *places)
         left_out[part["_row"].to_numpy()] = held
         counts[part["solution"][0]] = int(held.sum())
     return (gnss.filter(~left_out) if left_out.any() else gnss), counts
 
 
-def _noted(notes: IngestNotes, counts: Mapping[str, StreamCounts]) -> IngestNotes:
-    """How many rows each stream lost; for GNSS the `runs` row has that count."""
+def _note_left_out(notes: IngestNotes, counts: Mapping[str, StreamCounts]) -> IngestNotes:
+    """The notes with how many rows each stream lost; for GNSS the `runs` row has that count."""
     left_out = [
         f"{name}: {count.far_off} rows left out: their time is more than a day from the others or the positions"
         for name, count in counts.items()
@@ -272,7 +274,7 @@ def _noted(notes: IngestNotes, counts: Mapping[str, StreamCounts]) -> IngestNote
     return replace(notes, skipped_topics=(*notes.skipped_topics, *left_out))
 
 
-def _strays(frame: pl.DataFrame, few: float) -> Bools:
+def _are_strays(frame: pl.DataFrame, few: float) -> Bools:
     """Rows before 1970, and rows more than a day away from most of their solution, if at most the share `few`."""
     t_ns = times_ns(frame)
     stray: Bools = t_ns < 0
@@ -281,12 +283,12 @@ def _strays(frame: pl.DataFrame, few: float) -> Bools:
     solutions = frame["solution"].to_numpy() if "solution" in frame.columns else np.zeros(t_ns.size)
     for name in np.unique(solutions[~stray]):
         rows = np.flatnonzero((solutions == name) & ~stray)
-        far = _far_from_most(t_ns[rows])
+        far = _are_far_from_most(t_ns[rows])
         stray[rows] = far & (far.sum() <= few * rows.size)
     return stray
 
 
-def _far_from_most(t_ns: npt.NDArray[np.int64]) -> Bools:
+def _are_far_from_most(t_ns: npt.NDArray[np.int64]) -> Bools:
     """Times outside the largest group without a gap of more than a day."""
     order = np.argsort(t_ns, kind="stable")
     group = np.concatenate(([0], np.cumsum(np.diff(t_ns[order]) > DAY_NS)))
@@ -295,7 +297,7 @@ def _far_from_most(t_ns: npt.NDArray[np.int64]) -> Bools:
     return far
 
 
-def _far_from_any(t: pl.Series, positions: pl.Series) -> Bools:
+def _are_far_from_all(t: pl.Series, positions: pl.Series) -> Bools:
     """Times more than a day from every position, in 64 bits without overflow."""
     t_ns, known = (series.cast(pl.Datetime("ns")).cast(pl.Int64).to_numpy() for series in (t, positions))
     if not known.size:
@@ -306,9 +308,9 @@ def _far_from_any(t: pl.Series, positions: pl.Series) -> Bools:
     return far
 
 
-def _of_solution(part: pl.DataFrame, far: pl.DataFrame) -> StreamCounts:
+def _count_solution(part: pl.DataFrame, far: pl.DataFrame) -> StreamCounts:
     """Counts of one solution; `far`: rows of all solutions that were left out for a time of another day."""
-    counts = _in_order(part, ["t"])[1]
+    counts = _sort_rows(part, ["t"])[1]
     contradicting = 0
     if counts.duplicates:
         elsewhere = [(pl.col(name) != pl.col(name).first().over("t")).fill_null(False) for name in _PLACE]
@@ -317,13 +319,13 @@ def _of_solution(part: pl.DataFrame, far: pl.DataFrame) -> StreamCounts:
     return replace(counts, contradicting=contradicting, far_off=far_off)
 
 
-def stamp_counts(stream: Stream, frame: pl.DataFrame) -> StreamCounts:
+def count_stamps(stream: Stream, frame: pl.DataFrame) -> StreamCounts:
     """What `clean` would count in one stream, of GNSS in one solution."""
-    return _in_order(frame.drop_nulls("t"), _KEYS.get(stream, ["t"]))[1]
+    return _sort_rows(frame.drop_nulls("t"), _KEYS.get(stream, ["t"]))[1]
 
 
-def _in_order(frame: pl.DataFrame, keys: list[str]) -> tuple[pl.DataFrame, StreamCounts]:
-    """Rows in order of time, the first of each `keys`; how many were duplicates, how many recorded too late."""
+def _sort_rows(frame: pl.DataFrame, keys: list[str]) -> tuple[pl.DataFrame, StreamCounts]:
+    """Rows in order of time, the first of each `keys`; counts of the duplicates and of those recorded too late."""
     frame = frame.with_columns(pl.col("t").cast(pl.Datetime("ns", "UTC")))
     if (np.diff(times_ns(frame)) > 0).all():
         return frame, StreamCounts()
@@ -339,7 +341,7 @@ def _in_order(frame: pl.DataFrame, keys: list[str]) -> tuple[pl.DataFrame, Strea
 
 
 def _require_common_time(run: RunLog, clock_advice: ClockAdvice) -> None:
-    """Else not one position could be held against the odometer."""
+    """Refuse a run whose odometer overlaps the GNSS at no time: not one position could be held against it."""
     gnss = run.gnss
     odometer = run.odometer
     if gnss.is_empty() or odometer is None:
@@ -366,8 +368,8 @@ _LEAST_RATIO = 1.5
 _STEP_NOISE = 1.2
 
 
-def copies(t_s: Floats, latitude_deg: Floats, longitude_deg: Floats) -> Bools:
-    """Rows [s, deg] that repeat the place of the row before within one period of the receiver."""
+def held_positions(t_s: Floats, latitude_deg: Floats, longitude_deg: Floats) -> Bools:
+    """Rows (times [s], places [deg]) that repeat the place of the row before within one period of the receiver."""
     none: Bools = np.zeros(t_s.size, dtype=np.bool_)
     same = np.append(False, (np.diff(latitude_deg) == 0.0) & (np.diff(longitude_deg) == 0.0))
     updates = t_s[~same & np.isfinite(latitude_deg)]
@@ -386,11 +388,11 @@ def copies(t_s: Floats, latitude_deg: Floats, longitude_deg: Floats) -> Bools:
     return none
 
 
-def without_placeholders(fixes: pl.DataFrame, config: IngestConfig, fastest_mps: float) -> tuple[pl.DataFrame, int]:
-    """One solution in order of time, placeholders without a fix, and how many they are.
+def mark_placeholders(fixes: pl.DataFrame, config: IngestConfig, fastest_mps: float) -> tuple[pl.DataFrame, int]:
+    """One solution in order of time, its placeholders marked as without a fix, and how many they are.
 
-    0/0; places repeated to the last digit and farther than `placeholder_far_m` from the rest; and what comes before the
-    first fix, where the run goes on so far away that no train can have gone there.
+    Placeholders are: 0/0; places repeated to the last digit and farther than `placeholder_far_m` from the rest; and
+    what comes before the first fix, where the run goes on so far away that no train can have gone there.
     """
     latitude = floats(fixes, "latitude_deg")
     longitude = floats(fixes, "longitude_deg")
@@ -402,7 +404,7 @@ def without_placeholders(fixes: pl.DataFrame, config: IngestConfig, fastest_mps:
     if rows.size > 2:
         places = points_of(latitude[rows], longitude[rows]).surface
         placeholder = origin.copy()
-        placeholder[rows] = _far(times_ns(fixes)[rows], places, config, fastest_mps)
+        placeholder[rows] = _are_far_placeholders(times_ns(fixes)[rows], places, config, fastest_mps)
     count = int(placeholder.sum())
     if not count:
         return fixes, 0
@@ -411,7 +413,7 @@ def without_placeholders(fixes: pl.DataFrame, config: IngestConfig, fastest_mps:
     return fixes.with_columns(marked), count
 
 
-def _far(t_ns: Ints, places: Floats, config: IngestConfig, fastest_mps: float) -> Bools:
+def _are_far_placeholders(t_ns: Ints, places: Floats, config: IngestConfig, fastest_mps: float) -> Bools:
     """Placeholders among valid positions: far pieces of the run, between leaps that no train can make.
 
     A far piece counts if it is one place repeated exactly, or the brief begin of the run (search for a first fix).
@@ -439,7 +441,7 @@ def _far(t_ns: Ints, places: Floats, config: IngestConfig, fastest_mps: float) -
 
 
 def _is_brief(t_ns: Ints, until: int, config: IngestConfig) -> bool:
-    """The rows before `until` take no longer than the search for a first fix."""
+    """Whether the rows before `until` take no longer than the search for a first fix."""
     spent_s = (t_ns[until - 1] - t_ns[0]) / NS_PER_S
     whole_s = (t_ns[-1] - t_ns[0]) / NS_PER_S
     return bool(

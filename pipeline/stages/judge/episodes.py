@@ -1,4 +1,4 @@
-"""Episodes: since when and until when a position was wrong, and when that was detected (DOMAIN section 5.3)."""
+"""Episodes of a wrong position, with onset and detection; verdict and suspect of each alarm (DOMAIN section 5.3)."""
 
 from __future__ import annotations
 
@@ -10,9 +10,9 @@ import polars as pl
 
 from pipeline.stages.epochs.verdicts import AlarmEpisode, FailureLog
 from pipeline.stages.evidence.evidence import NOTHING
-from pipeline.stages.judge.failures import ErrorHistory, Failure, Jump, failure_at
+from pipeline.stages.judge.failures import ErrorHistory, Failure, Jump, failure_between
 from pipeline.stages.judge.judged import ODOMETER, WRONG, JudgedEpochs
-from pipeline.stages.judge.judgement import margins_m
+from pipeline.stages.judge.judgement import healthy_margins_m
 from schemas.arrays import NS_PER_S, Bools, Floats, spans_of
 from schemas.config import Configuration, HazardConfig
 from schemas.conform import dtypes, table_of_rows
@@ -63,8 +63,8 @@ class Episode(Extent):
     failure: Failure
 
     @property
-    def undetected_ns(self) -> tuple[int, int]:
-        """From the begin to detection or to the end."""
+    def undetected_span_ns(self) -> tuple[int, int]:
+        """Begin and end [ns] of the time in which the fault was there unnoticed: up to its detection, or to its end."""
         return self.begin_ns, self.end_ns if self.detection.t_ns is None else self.detection.t_ns
 
 
@@ -87,16 +87,16 @@ def find_episodes(
     """
     episodes: list[Episode] = []
     floor = 0
-    for mark in np.flatnonzero(history.judged.is_wrong | _offered_wrong(history)).tolist():
+    for mark in np.flatnonzero(history.judged.is_wrong | _complete_wrong_offer(history)).tolist():
         if mark >= floor:
-            extent = _extent(history, mark, floor)
-            episodes.append(_episode(history, extent, failures, log, faults))
+            extent = _extent_about(history, mark, floor)
+            episodes.append(_episode_of(history, extent, failures, log, faults))
             floor = max(extent.end, mark + 1, 0 if extent.jump_back is None else extent.jump_back.last + 1)
     return episodes
 
 
-def _offered_wrong(history: ErrorHistory) -> Bools:
-    """Positions that complete an offer judged wrong; balises that a jump passes on its way belong to the jump."""
+def _complete_wrong_offer(history: ErrorHistory) -> Bools:
+    """Positions that complete an offer judged wrong, without those inside a jump, which stands for them."""
     marked = np.zeros(history.size, dtype=np.bool_)
     marked[history.completing[history.offers.offered & history.offers.judged.is_wrong]] = True
     for jump in history.jumps:
@@ -104,14 +104,14 @@ def _offered_wrong(history: ErrorHistory) -> Bools:
     return marked
 
 
-def _extent(history: ErrorHistory, mark: int, floor: int) -> Extent:
-    """Since and until when positions are off around a mark; no earlier than `floor`."""
+def _extent_about(history: ErrorHistory, mark: int, floor: int) -> Extent:
+    """The extent of the fault that position `mark` belongs to, not before position `floor`."""
     onset = history.after_noise(floor, mark)
     step = next(iter(history.jumps_in(onset, mark + 1)), None)
     settled = int(history.settled_from[mark])
     after_step = mark if step is None else max(mark, step.last)
     later = history.jumps_in(mark + 1, settled + 1)
-    back = next((jump for jump in later if jump.first > after_step and _is_back(history, jump)), None)
+    back = next((jump for jump in later if jump.first > after_step and _leads_back(history, jump)), None)
     return Extent(
         mark=mark,
         onset=onset if step is None else max(floor, step.first),
@@ -121,21 +121,22 @@ def _extent(history: ErrorHistory, mark: int, floor: int) -> Extent:
     )
 
 
-def _is_back(history: ErrorHistory, jump: Jump) -> bool:
-    """The jump goes against the error before it, and the error after it is within the limit."""
+def _leads_back(history: ErrorHistory, jump: Jump) -> bool:
+    """Whether a jump goes against the error before it and leaves an error within the failure limit."""
     judged = history.judged
     back = float(judged.middle_m[jump.first - 1]) * jump.step_m < 0.0
     within = float(judged.least_m[jump.last]) <= history.config.hazards.limits.failure_m
     return back and within and judged.code[jump.last] != WRONG
 
 
-def _episode(
+def _episode_of(
     history: ErrorHistory, extent: Extent, failures: Sequence[Failure], log: FailureLog, faults: pl.DataFrame | None
 ) -> Episode:
+    """The episode of an extent, with its instants, its detection and the failure that it overlaps."""
     step = extent.step
     end_ns = int(history.t_ns[extent.end]) if extent.end < history.size else int(history.t_ns[-1]) + 1
-    onset_ns, detection = _detected(history, extent, end_ns, log, faults)
-    failed = _failed(history, extent)
+    onset_ns, detection = _onset_and_detection(history, extent, end_ns, log, faults)
+    failed = _failure_begin(history, extent)
     in_use = (failure for failure in failures if failure.first < extent.end and failure.last >= extent.onset)
     no_use = np.zeros(0, dtype=np.int64)
     return Episode(
@@ -144,22 +145,22 @@ def _episode(
         onset_ns=onset_ns,
         end_ns=end_ns,
         failed=failed,
-        may_ns=None if failed is None else _failed_may_ns(history, failed),
+        may_ns=None if failed is None else _earliest_failure_ns(history, failed),
         detection=detection,
-        failure=next(in_use, None) or failure_at(history, extent.onset, extent.end, no_use),
+        failure=next(in_use, None) or failure_between(history, extent.onset, extent.end, no_use),
     )
 
 
-def _detected(
+def _onset_and_detection(
     history: ErrorHistory, extent: Extent, end_ns: int, log: FailureLog, faults: pl.DataFrame | None
 ) -> tuple[int, Detection]:
-    """Onset, as a `faults` stream names it, else the first epoch of the step or drift; and detection.
+    """Onset [ns] (from the `faults` stream, else the first epoch of the step or drift), and the first detection.
 
     A drift is visible late: an alarm up to `alarm_lead_s` before its onset becomes the onset, with T_D 0. Detection is
     the first fail of any monitor from the onset on; at once where an alarm was standing.
     """
     onset_ns = int(history.t_ns[extent.onset])
-    named_ns = named_onset_ns(faults, onset_ns, int(history.t_ns[extent.mark]))
+    named_ns = injected_onset_ns(faults, onset_ns, int(history.t_ns[extent.mark]))
     alarm_ns = None
     if named_ns is None and extent.step is None:
         lead_ns = round(history.config.hazards.alarm_lead_s * NS_PER_S)
@@ -172,8 +173,11 @@ def _detected(
     return begin_ns, replace(detection, standing=alarm_ns is not None)
 
 
-def named_onset_ns(faults: pl.DataFrame | None, onset_ns: int, mark_ns: int) -> int | None:
-    """Begin of the fault that a `faults` stream names: the last one before the onset as seen, else the first after."""
+def injected_onset_ns(faults: pl.DataFrame | None, onset_ns: int, mark_ns: int) -> int | None:
+    """Begin [ns] of the injected fault of an episode: the last one before the onset as seen, else the first after it.
+
+    `mark_ns`: first wrong position. None where no fault of the `faults` stream lasted then.
+    """
     if faults is None:
         return None
     of_gnss = ~pl.col("target").str.contains(_ODOMETER)
@@ -184,8 +188,11 @@ def named_onset_ns(faults: pl.DataFrame | None, onset_ns: int, mark_ns: int) -> 
     return before[-1] if before else next(iter(begins), None)
 
 
-def _failed(history: ErrorHistory, extent: Extent) -> int | None:
-    """First position that stays wrong for `failure_hold_s`, a step at once; else the first wrong one of the episode."""
+def _failure_begin(history: ErrorHistory, extent: Extent) -> int | None:
+    """Number of the first position that stays wrong for `failure_hold_s`, else of the first wrong one.
+
+    Within a step at once.
+    """
     onset = extent.onset
     step = extent.step
     spans = [(onset + first, onset + last) for first, last in spans_of(history.judged.is_wrong[onset : extent.end])]
@@ -197,10 +204,10 @@ def _failed(history: ErrorHistory, extent: Extent) -> int | None:
     return spans[0][0] if spans else None
 
 
-def _failed_may_ns(history: ErrorHistory, failed: int) -> int | None:
-    """When the failure may have begun: the first position not proved right whose interval reaches beyond the limit.
+def _earliest_failure_ns(history: ErrorHistory, failed: int) -> int | None:
+    """Earliest instant at which the failure may have begun [ns]: the first position whose interval exceeds the limit.
 
-    Looked for since the last right position. None where the evidence is silent for some of that time.
+    Counted are the positions since the last one proved right. None where the evidence is silent for some of that time.
     """
     judged = history.judged
     right = np.flatnonzero(judged.is_right[:failed])
@@ -234,7 +241,7 @@ def alarms_table(
     Source:
         DOMAIN section 5.3; CONTRACT section 3.
     """
-    healthy = healthy_across(epochs, config.hazards)
+    healthy = within_noise_across(epochs, config.hazards)
     rows = [
         {
             "solution": name,
@@ -243,18 +250,18 @@ def alarms_table(
             "t_end": alarm.end_ns,
             "monitors": list(alarm.monitors),
             "peak_ratio": alarm.peak_ratio,
-            "verdict": verdict_of(alarm, epochs, healthy, config.hazards).value,
-            "suspect": suspect_of(epochs, alarm.start_ns, alarm.end_ns, config).value,
-            "hazard_id": next((number for number, episode in enumerate(hazards) if _belongs(alarm, episode)), None),
-            **_place_of(epochs, alarm.first),
+            "verdict": alarm_verdict(alarm, epochs, healthy, config.hazards).value,
+            "suspect": suspected_source(epochs, alarm.start_ns, alarm.end_ns, config).value,
+            "hazard_id": next((number for number, episode in enumerate(hazards) if _is_alarm_of(alarm, episode)), None),
+            **_place_columns(epochs, alarm.first),
         }
         for number, alarm in enumerate(log.alarms)
     ]
     return table_of_rows(rows, dtypes(Alarms))
 
 
-def _place_of(epochs: MatchedEpochs, epoch: int) -> dict[str, object]:
-    """Where the train was matched at an epoch."""
+def _place_columns(epochs: MatchedEpochs, epoch: int) -> dict[str, object]:
+    """Columns of the net element and measure [m] that an epoch was matched to."""
     element, measure_m = int(epochs.element[epoch]), float(epochs.measure_m[epoch])
     return {
         "netelement_id": epochs.elements[element] if element >= 0 else None,
@@ -262,8 +269,8 @@ def _place_of(epochs: MatchedEpochs, epoch: int) -> dict[str, object]:
     }
 
 
-def healthy_across(epochs: JudgedEpochs, config: HazardConfig) -> Healthy:
-    """Per axis across the track, epochs whose error by the reference is within the noise of both."""
+def within_noise_across(epochs: JudgedEpochs, config: HazardConfig) -> Healthy:
+    """Per axis across the track the epochs whose error against the reference is within the noise of both."""
     reference_m = np.nan_to_num(epochs.judgements.half_m / config.evidence_factor)
     axes = {
         "cross": (epochs.error_cross_m, epochs.sigma_cross_m),
@@ -275,8 +282,8 @@ def healthy_across(epochs: JudgedEpochs, config: HazardConfig) -> Healthy:
     }
 
 
-def verdict_of(alarm: AlarmEpisode, epochs: JudgedEpochs, healthy: Healthy, config: HazardConfig) -> Verdict:
-    """True where the whole interval was beyond the margin at some epoch, false where all of it stayed within.
+def alarm_verdict(alarm: AlarmEpisode, epochs: JudgedEpochs, healthy: Healthy, config: HazardConfig) -> Verdict:
+    """Verdict of an alarm: true if the whole interval exceeded the margin at some epoch, false if all stayed within.
 
     Only reference or balise reads can say false, and only of every position from 300 s before the alarm to its end; of
     an alarm across the track only a reference, for four metres aside are another track.
@@ -285,18 +292,18 @@ def verdict_of(alarm: AlarmEpisode, epochs: JudgedEpochs, healthy: Healthy, conf
     first = int(np.searchsorted(epochs.t_ns, since_ns))
     part = first + np.flatnonzero(epochs.positioned[first : alarm.last + 1])
     judged = epochs.judgements.at(part)
-    can_say_false = judged.by_truth
+    can_say_false = judged.rests_on_truth
     axes = {monitor.axis for monitor in ALL_MONITORS if monitor.name in alarm.monitors}
     for axis in healthy.keys() & axes:
         can_say_false = can_say_false & healthy[axis][part]
     if judged.wrong_track.any():
         return Verdict.TRUE
-    margin_m = margins_m(epochs.sigma_along_m[part], config)
-    return verdict_within(judged.low_m, judged.high_m, margin_m, can_say_false)
+    margin_m = healthy_margins_m(epochs.sigma_along_m[part], config)
+    return verdict_of_intervals(judged.low_m, judged.high_m, margin_m, can_say_false)
 
 
-def verdict_within(low_m: Floats, high_m: Floats, margin_m: Floats, can_say_false: Bools) -> Verdict:
-    """By the intervals of the error (NaN: not known) at the positions of an alarm, against their margins."""
+def verdict_of_intervals(low_m: Floats, high_m: Floats, margin_m: Floats, can_say_false: Bools) -> Verdict:
+    """Verdict by the intervals of the error at the positions of an alarm (NaN: not known) against their margins [m]."""
     beyond = (low_m > margin_m) | (high_m < -margin_m)
     within = can_say_false & (low_m >= -margin_m) & (high_m <= margin_m)
     if beyond.any():
@@ -304,14 +311,14 @@ def verdict_within(low_m: Floats, high_m: Floats, margin_m: Floats, can_say_fals
     return Verdict.FALSE if within.size and within.all() else Verdict.UNKNOWN
 
 
-def _belongs(alarm: AlarmEpisode, episode: Episode) -> bool:
-    """The fault lasted during the alarm, or the alarm detected it."""
+def _is_alarm_of(alarm: AlarmEpisode, episode: Episode) -> bool:
+    """Whether the fault of the episode lasted during the alarm, or the alarm detected it."""
     lasted = alarm.start_ns <= episode.end_ns and alarm.end_ns >= episode.onset_ns
     detected_ns = episode.detection.t_ns
     return lasted or (detected_ns is not None and alarm.start_ns <= detected_ns <= alarm.end_ns)
 
 
-def suspect_of(epochs: JudgedEpochs, begin_ns: int, end_ns: int, config: Configuration) -> Suspect:
+def suspected_source(epochs: JudgedEpochs, begin_ns: int, end_ns: int, config: Configuration) -> Suspect:
     """An opinion, on which only its column depends; from `suspect_lookback_s` before an alarm or hazard to its end.
 
     The first row that applies; the map is found over several runs (`pipeline/results/figures/map_errors.py`).
@@ -327,12 +334,12 @@ def suspect_of(epochs: JudgedEpochs, begin_ns: int, end_ns: int, config: Configu
     first = int(np.searchsorted(epochs.t_ns, begin_ns - round(config.hazards.suspect_lookback_s * NS_PER_S)))
     part = slice(first, max(first, int(np.searchsorted(epochs.t_ns, end_ns, side="right"))))
     judged = epochs.judgements.at(part)
-    margin_m = margins_m(epochs.sigma_along_m[part], config.hazards)
+    margin_m = healthy_margins_m(epochs.sigma_along_m[part], config.hazards)
     left = (judged.least_m > margin_m) | judged.wrong_track
     if (left & (judged.kind != ODOMETER)).any():
         return Suspect.GNSS
     contradicted = epochs.odometer_stood[part] | epochs.odometer_wrong[part]
-    if contradicted.any() or _parted_together(epochs, part, margin_m, config):
+    if contradicted.any() or _leave_odometer_together(epochs, part, margin_m, config):
         return Suspect.ODOMETER
     if left.any():
         return Suspect.GNSS
@@ -340,8 +347,8 @@ def suspect_of(epochs: JudgedEpochs, begin_ns: int, end_ns: int, config: Configu
     return Suspect.TRACK if ambiguous.any() else Suspect.UNKNOWN
 
 
-def _parted_together(epochs: JudgedEpochs, part: slice, margin_m: Floats, config: Configuration) -> bool:
-    """Position and Doppler agree with each other where both left the odometer, by half the margin of the position."""
+def _leave_odometer_together(epochs: JudgedEpochs, part: slice, margin_m: Floats, config: Configuration) -> bool:
+    """Whether position and Doppler agree at some epoch at which both have left the odometer by half the margin."""
     columns = np.array([epochs.path_m[part], epochs.odometer_m[part], epochs.velocity_along_mps[part]])
     known = np.isfinite(columns).all(axis=0)
     if known.sum() < 2:

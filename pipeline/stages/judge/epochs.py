@@ -1,4 +1,4 @@
-"""Faults that were put into the positions on purpose, as the `faults` stream of a trial names them."""
+"""Epochs and offers of one solution against the evidence: judgement, direction, movement, time in use, state."""
 
 from __future__ import annotations
 
@@ -10,7 +10,13 @@ from pipeline.stages.epochs.verdicts import MonitoredEpochs
 from pipeline.stages.evidence import TrainEvidence, true_places
 from pipeline.stages.evidence.evidence import Span, within_spans
 from pipeline.stages.judge.judged import REFERENCE, RIGHT, WRONG, JudgedEpochs, JudgedOffers, Judgements
-from pipeline.stages.judge.judgement import JudgeInput, MatchedPositions, judge_positions, judgements_of, valid_at_ns
+from pipeline.stages.judge.judgement import (
+    JudgeInput,
+    MatchedPositions,
+    judge_positions,
+    judge_with_odometer,
+    valid_at_ns,
+)
 from pipeline.stages.track.geodesy import points_of
 from pipeline.stages.track.path import TravelledPath
 from schemas.arrays import NS_PER_S, Bools, Floats, Ints, floats, ints, runs_of, spans_of, times_ns
@@ -23,8 +29,8 @@ from schemas.stages import AlignedEpochs
 _GNSS = r"(?i)^(along|cross|up|east|north|position|velocity|gnss|satellites?|gps|galileo|glonass|beidou|[A-Z][0-9]{2})$"
 
 
-def under_injection(t_ns: Ints, faults: pl.DataFrame | None, recovery_s: float) -> Bools:
-    """Instants from the begin of an injected fault of GNSS to `recovery_s` after its end, where it has one."""
+def injected_at(t_ns: Ints, faults: pl.DataFrame | None, recovery_s: float) -> Bools:
+    """Instants at which an injected fault of GNSS acts: from its begin to `recovery_s` after its end, if it has one."""
     under = np.zeros(t_ns.size, dtype=np.bool_)
     if faults is None:
         return under
@@ -35,13 +41,13 @@ def under_injection(t_ns: Ints, faults: pl.DataFrame | None, recovery_s: float) 
     return under
 
 
-def cross_errors(given: JudgeInput, heading_deg: Floats) -> Floats:
+def cross_errors_m(given: JudgeInput, heading_deg: Floats) -> Floats:
     """Position minus reference, left of growing path and upwards [m]; shape (2, epochs).
 
     NaN where the reference is silent, and where the position is farther ahead or behind than the failure limit: over
     such a distance a curve alone is metres aside, and a slope metres up.
     """
-    at_ns = given.instants_of_epochs()
+    at_ns = given.epochs_valid_at_ns()
     errors_m = np.full((2, at_ns.size), np.nan)
     reference = given.reference
     if reference is not None and reference.height >= 2:
@@ -81,14 +87,14 @@ class OdometerSteps:
 
 
 def odometer_steps(given: JudgeInput) -> OdometerSteps:
-    """What the odometer says of the steps between the epochs; without one, or of unknown origin, nothing of motion."""
-    at_ns = given.instants_of_epochs()
+    """Movement from epoch to epoch by the odometer; without one, or of unknown origin, no motion is known."""
+    at_ns = given.epochs_valid_at_ns()
     odometry = given.odometry
     # One that may be made of the positions tells no motion (DOMAIN section 5.0).
     if odometry is None or not odometry.independent:
         return OdometerSteps(*np.zeros((2, at_ns.size), dtype=np.bool_))
-    moves = _to_the_next(odometry.moved(at_ns), at_ns.size)
-    counts = _to_the_next(np.isfinite(odometry.steps_m(at_ns)), at_ns.size)
+    moves = _steps_by_epoch(odometry.moved(at_ns), at_ns.size)
+    counts = _steps_by_epoch(np.isfinite(odometry.steps_m(at_ns)), at_ns.size)
     path_m = given.solution.epochs.path_m
     standstills: list[Span] = []
     for first, last in spans_of(counts & ~moves):
@@ -107,13 +113,13 @@ def travel_direction(
     Without an odometer the evidence decides, as a position that jumps back does not turn the train. With one the
     odometer does, unless the reference shows that it counts up in reverse.
     """
-    train_m = path_m - along.known_m(config.known_error_m)
-    moved_m, noise_m, _ = _moved_m(at_ns, train_m, along.half_m, config.turn_s)
+    train_m = path_m - along.known_error_m(config.known_error_m)
+    moved_m, noise_m, _ = _movement_ahead(at_ns, train_m, along.half_m, config.turn_s)
     sure = np.abs(moved_m) > noise_m
     by_reference = along.kind == REFERENCE
     if has_odometer:
         # Not over a turn: the odometer knows best when that was.
-        turned_by, _, _ = _moved_m(at_ns, direction.astype(np.float64), along.half_m, config.turn_s)
+        turned_by, _, _ = _movement_ahead(at_ns, direction.astype(np.float64), along.half_m, config.turn_s)
         sure &= by_reference & (turned_by == 0.0)
     rows = np.flatnonzero(sure)
     if rows.size == 0:
@@ -126,43 +132,38 @@ def travel_direction(
     return direction * np.where(by_reference, sense * direction[last], 1)
 
 
-def moving(
+def moves_and_may_move(
     at_ns: Ints, reference_m: Floats, half_m: Floats, steps: OdometerSteps, standing: Bools, config: Configuration
 ) -> tuple[Bools, Bools]:
-    """Per epoch whether the train moves to the next one, as is known, and whether it may.
+    """Whether the train is known to move from each epoch to the next, and whether it may move; shapes (epochs,).
 
-    It may too where neither reference nor odometer knows.
-
-    By the reference (`reference_m` +- `half_m`) it does where its movement over a second exceeds dead band and noise.
+    It may also move where neither reference nor odometer knows. By the reference (`reference_m` +- `half_m`) it moves
+    where its movement over a second exceeds dead band and noise. `standing`: the odometer shows none, positions do.
     """
-    moved_m, noise_m, elapsed_s = _moved_m(at_ns, reference_m, half_m, config.align.speed_window_s)
+    moved_m, noise_m, elapsed_s = _movement_ahead(at_ns, reference_m, half_m, config.align.speed_window_s)
     by_reference = np.abs(moved_m) > config.matching.deadband_mps * elapsed_s + noise_m
     moves = by_reference | (steps.moves & steps.counts)
     sure = np.isfinite(moved_m) | (steps.counts & ~standing)
-    moves, sure = (_to_the_next(steps_of[:-1], at_ns.size) for steps_of in (moves, sure))
+    moves, sure = (_steps_by_epoch(steps_of[:-1], at_ns.size) for steps_of in (moves, sure))
     return moves & sure, moves | ~sure
 
 
-def _moved_m(at_ns: Ints, place_m: Floats, half_m: Floats, window_s: float) -> tuple[Floats, Floats, Floats]:
-    """From each epoch to the one `window_s` later: the distance [m], both half intervals [m], the time [s]."""
+def _movement_ahead(at_ns: Ints, place_m: Floats, half_m: Floats, window_s: float) -> tuple[Floats, Floats, Floats]:
+    """From each epoch to the one `window_s` later: distance [m], sum of both half intervals [m], time [s]."""
     ahead = np.searchsorted(at_ns, at_ns + round(window_s * NS_PER_S)).clip(0, at_ns.size - 1)
     return place_m[ahead] - place_m, half_m + half_m[ahead], (at_ns[ahead] - at_ns) / NS_PER_S
 
 
-def _to_the_next(steps: Bools, size: int) -> Bools:
-    """Steps as a column of epochs: each epoch has that of the step after it, the last epoch that of the step before."""
+def _steps_by_epoch(steps: Bools, size: int) -> Bools:
+    """Steps as a column of `size` epochs: each has that of the step after it, the last one that of the step before."""
     last = steps[-1:] if steps.size else np.zeros(1, dtype=np.bool_)
     return np.concatenate([steps, last])[:size]
 
 
-def beyond_confidence(
+def exceeds_odometer_confidence(
     t_ns: Ints, odometer_m: Floats, train_m: Floats, half_m: Floats, accepted_ns: Ints, lds: LdsConfig
 ) -> Bools:
-    """The distance counted since the last accepted VB is wrong by more than 5 m + 5 % (SUBSET-041 5.3.1.1).
-
-    `train_m` +- `half_m`: path position of the train, NaN where not known; the error counts where it exceeds the
-    allowance and the half intervals of both places.
-    """
+    """Epochs at which the distance since the last accepted VB is wrong by more than 5 m + 5 % (SUBSET-041 5.3.1.1)."""
     beyond = np.zeros(t_ns.size, dtype=np.bool_)
     rows = np.flatnonzero(np.isfinite(odometer_m) & np.isfinite(train_m))
     last = np.searchsorted(accepted_ns, t_ns[rows], side="right") - 1
@@ -181,8 +182,8 @@ def beyond_confidence(
     return beyond
 
 
-def speed_at(epochs: AlignedEpochs, at_ns: Ints) -> Floats:
-    """Speed [m/s] as the epochs around each instant show it, the train's own; NaN where no epoch knows it."""
+def speed_at_mps(epochs: AlignedEpochs, at_ns: Ints) -> Floats:
+    """Speed of the train at each instant, interpolated between epochs [m/s]; NaN where no epoch knows it."""
     known = np.isfinite(epochs.speed_mps)
     if not known.any():
         return np.full(at_ns.size, np.nan)
@@ -230,7 +231,7 @@ def time_in_use(epochs: MonitoredEpochs, code: Ints, config: Configuration) -> T
     used_s = np.zeros(known.size)
     used_s[known] = np.where(in_use[known], steps.left_s(steps.near_s), 0.0)
     wrong_s = np.where(code == WRONG, used_s, 0.0)
-    counted_s = np.where(wrong_s > 0.0, wrong_s, _counted_s(epochs.t_ns, known, steps, config))
+    counted_s = np.where(wrong_s > 0.0, wrong_s, _accounted_s(epochs.t_ns, known, steps, config))
     return TimeInUse(in_use, used_s, wrong_s, counted_s)
 
 
@@ -251,6 +252,7 @@ class _StepTimes:
 
     @classmethod
     def of(cls, epochs: MonitoredEpochs, known: Bools, config: Configuration) -> _StepTimes:
+        """Times of the steps between positions; `known`: epochs with a position."""
         all_ns = epochs.t_ns
         t_ns = all_ns[known]
         all_s = (all_ns - all_ns[:1]) / NS_PER_S
@@ -266,7 +268,7 @@ class _StepTimes:
         return cls(all_s[known], near_s, alone_s, step_s > gap_s, negated.ravel(), blocked_s)
 
     def left_s(self, length_s: Floats) -> Floats:
-        """This much time before each position, less the negated part of it."""
+        """The last `length_s` before each position, less the negated part of it [s]."""
         if self.edge_s.size == 0:
             return length_s
         until_s, since_s = (np.interp(t_s, self.edge_s, self.blocked_s) for t_s in (self.end_s, self.end_s - length_s))
@@ -282,8 +284,8 @@ def _negated_spans(t_s: Floats, negated: Bools, withheld: Bools, reaction_s: Flo
     return np.column_stack([np.minimum(from_s, until_s), until_s])
 
 
-def _counted_s(t_ns: Ints, known: Bools, steps: _StepTimes, config: Configuration) -> Floats:
-    """Time since the epoch before [s], of a gap no more than a movement is interpolated over.
+def _accounted_s(t_ns: Ints, known: Bools, steps: _StepTimes, config: Configuration) -> Floats:
+    """Time that each epoch accounts for [s]: since the epoch before, of a gap no more than is interpolated over.
 
     Of epochs between two near positions the later position accounts for all, the others for none.
     """
@@ -326,23 +328,25 @@ def judged_epochs(given: JudgeInput, steps: OdometerSteps) -> JudgedEpochs:
     """
     epochs = given.solution.epochs
     config = given.config
-    at_ns = given.instants_of_epochs()
-    positions = MatchedPositions.of(epochs, given.evidence.network.track.index)
+    at_ns = given.epochs_valid_at_ns()
+    positions = MatchedPositions.of_epochs(epochs, given.evidence.network.track.index)
     evidence = given.evidence_at(at_ns)
-    along = judgements_of(given, positions, at_ns, evidence)
+    along = judge_with_odometer(given, positions, at_ns, evidence)
     has_odometer = given.odometry is not None
     direction = travel_direction(epochs.direction, along, at_ns, epochs.path_m, has_odometer, config.hazards)
     judged = along.turned(direction)
-    train_m = positions.path_m - along.known_m(config.hazards.known_error_m)
+    train_m = positions.path_m - along.known_error_m(config.hazards.known_error_m)
     reference_m = np.where(along.kind == REFERENCE, train_m, np.nan)
     standing = within_spans(at_ns, given.evidence.standstills)
     accepted_ns = given.solution.crossings.t_ns[given.solution.crossings.accepted]
-    odometer_wrong = beyond_confidence(epochs.t_ns, epochs.odometer_m, train_m, along.half_m, accepted_ns, config.lds)
+    odometer_wrong = exceeds_odometer_confidence(
+        epochs.t_ns, epochs.odometer_m, train_m, along.half_m, accepted_ns, config.lds
+    )
     undiagnosed = epochs.diagnosis_faulty | odometer_wrong
     use = time_in_use(epochs, along.code, config)
-    injected = under_injection(epochs.t_ns, given.faults, config.lds.recovery_s)
-    error_cross_m, error_up_m = cross_errors(given, epochs.heading_deg)
-    moves, may_move = moving(at_ns, reference_m, along.half_m, steps, standing, config)
+    injected = injected_at(epochs.t_ns, given.faults, config.lds.recovery_s)
+    error_cross_m, error_up_m = cross_errors_m(given, epochs.heading_deg)
+    moves, may_move = moves_and_may_move(at_ns, reference_m, along.half_m, steps, standing, config)
     return JudgedEpochs(
         **epochs.columns()
         | {"direction": direction}
@@ -352,7 +356,7 @@ def judged_epochs(given: JudgeInput, steps: OdometerSteps) -> JudgedEpochs:
             "at_ns": at_ns,
             "judgements": judged,
             "true_places": true_places(evidence, given.evidence.network.track),
-            "error_along_m": judged.known_m(config.hazards.known_error_m),
+            "error_along_m": judged.known_error_m(config.hazards.known_error_m),
             "error_cross_m": error_cross_m,
             "error_up_m": error_up_m,
             "train_m": train_m,
@@ -374,7 +378,9 @@ def direction_by_evidence(
     """Direction of travel of a run without an odometer, before anything is judged; shape (epochs,)."""
     at_ns = valid_at_ns(epochs.t_ns, vehicle)
     index = evidence.network.track.index
-    along = judge_positions(MatchedPositions.of(epochs, index), evidence.at(at_ns), path.routes(index), config.hazards)
+    along = judge_positions(
+        MatchedPositions.of_epochs(epochs, index), evidence.at(at_ns), path.routes(index), config.hazards
+    )
     return travel_direction(epochs.direction, along, at_ns, epochs.path_m, has_odometer=False, config=config.hazards)
 
 
@@ -401,15 +407,15 @@ def judged_offers(given: JudgeInput, epochs: JudgedEpochs) -> JudgedOffers:
     index = given.evidence.network.track.index
     positions = MatchedPositions.of_balises(crossings, rows, index, sure[before] & sure[epoch])
     at_ns = np.where(crossings.virtual[rows], given.instants(t_ns), t_ns)
-    along = judgements_of(given, positions, at_ns, given.evidence_at(at_ns))
+    along = judge_with_odometer(given, positions, at_ns, given.evidence_at(at_ns))
     judged = along.turned(epochs.direction[before])
     passages = given.solution.passages
     late = passages.filter(pl.col("odometer_distance_m") > pl.col("window_close_m"))["crossing_id"]
-    return JudgedOffers.of(
+    return JudgedOffers.of_crossings(
         crossings,
         rows,
         beyond_window=np.isin(rows, ints(late)),
         judged=judged,
-        location_error_m=judged.known_m(hazards.known_error_m),
+        location_error_m=judged.known_error_m(hazards.known_error_m),
         proof_margin_m=np.where(judged.is_right, hazards.limits.failure_m - judged.largest_m, np.nan),
     )

@@ -1,4 +1,4 @@
-"""Jumps: steps of GNSS minus evidence accumulated over at most a second (DOMAIN section 5.3; DIAG, Hazards)."""
+"""Jumps of the position, the history of its error, and position failures in use (DOMAIN section 5.3; DIAG, Hazards)."""
 
 from __future__ import annotations
 
@@ -37,16 +37,22 @@ class Jump(NamedTuple):
 
 
 def jumps_of(positions: JudgedEpochs, odometry: Odometry | None, gap_ns: Ints, config: HazardConfig) -> list[Jump]:
-    """All jumps of the positions, in order of time; numbers are rows of `positions`."""
+    """Jumps between the positions, in order of time; numbers are rows of `positions`, `gap_ns` the longest steps."""
     counted_m = np.full(max(positions.height - 1, 0), np.nan)
     if odometry is not None:
         counted_m = odometry.steps_m(positions.at_ns)
-    steps = steps_of(positions.t_ns, positions.path_m, positions.reference_m, counted_m, gap_ns)
+    steps = position_changes(positions.t_ns, positions.path_m, positions.reference_m, counted_m, gap_ns)
     return find_jumps(steps, positions.direction, config)
 
 
-def steps_of(t_ns: Ints, path_m: Floats, reference_m: Floats, counted_m: Floats, gap_ns: Ints) -> PositionChanges:
-    """`reference_m`: path position by the reference, NaN elsewhere; there the odometer's steps `counted_m` serve."""
+def position_changes(
+    t_ns: Ints, path_m: Floats, reference_m: Floats, counted_m: Floats, gap_ns: Ints
+) -> PositionChanges:
+    """Running sum of position minus evidence [m], from position to position.
+
+    Evidence is `reference_m`, the path position by the reference (NaN elsewhere), else the odometer's steps
+    `counted_m`.
+    """
     by_reference_m = np.diff(path_m - reference_m)
     change_m = np.where(np.isfinite(by_reference_m), by_reference_m, np.diff(path_m) - counted_m)
     linked = np.isfinite(change_m) & (np.diff(t_ns) <= gap_ns[1:])
@@ -55,21 +61,22 @@ def steps_of(t_ns: Ints, path_m: Floats, reference_m: Floats, counted_m: Floats,
 
 
 def find_jumps(steps: PositionChanges, direction: Ints, config: HazardConfig) -> list[Jump]:
-    """All jumps in order of time."""
-    largest_m = _largest_step(steps, config)
+    """Jumps in order of time: where the changes within a window exceed the limit, in either direction."""
+    largest_m = _largest_changes_m(steps, config)
     jumps: list[Jump] = []
     for sign in (1.0, -1.0):
         for begin, end in spans_of(largest_m * sign > config.limits.jump_m):
-            first, last = _extent(steps, begin, end, sign, config)
+            first, last = _jump_ends(steps, begin, end, sign, config)
             step_m = float(steps.excess_m[last] - steps.excess_m[first - 1]) * float(direction[last])
             jumps.append(Jump(first, last, step_m))
     return sorted(jumps, key=lambda jump: jump[:2])
 
 
-def _largest_step(steps: PositionChanges, config: HazardConfig) -> Floats:
-    """The largest signed change up to each position, from those in the window before it, always from the last before.
+def _largest_changes_m(steps: PositionChanges, config: HazardConfig) -> Floats:
+    """The largest signed change [m] up to each position, over the positions in the window before it.
 
-    Lag by lag: as soon as no pair of positions so far apart is in the window, no longer lag has one.
+    The one just before always counts. Lag by lag: as soon as no pair of positions so far apart is in the window, no
+    longer lag has one.
     """
     excess_m = steps.excess_m
     largest_m = np.zeros(excess_m.size)
@@ -89,7 +96,7 @@ def _largest_step(steps: PositionChanges, config: HazardConfig) -> Floats:
     return largest_m
 
 
-def _extent(steps: PositionChanges, begin: int, end: int, sign: float, config: HazardConfig) -> tuple[int, int]:
+def _jump_ends(steps: PositionChanges, begin: int, end: int, sign: float, config: HazardConfig) -> tuple[int, int]:
     """First and last position of the increments that make up the jump over the limit at positions `begin..end`.
 
     Those of at least `jump_share` of the largest count, from one window before `begin` on.
@@ -121,14 +128,17 @@ class ErrorHistory:
 
     @property
     def size(self) -> int:
+        """Number of positions."""
         return self.positions.height
 
     @property
     def t_ns(self) -> Ints:
+        """Times of the positions [ns]."""
         return self.positions.t_ns
 
     @property
     def judged(self) -> Judgements:
+        """What the judge says of each position."""
         return self.positions.judgements
 
     def offers_between(self, begin: int, end: int) -> Bools:
@@ -152,19 +162,19 @@ class ErrorHistory:
         return floor + int(within_noise[-1]) + 1 if within_noise.size else floor
 
 
-def error_history_of(
+def error_history(
     epochs: JudgedEpochs, offers: JudgedOffers, odometry: Odometry | None, config: Configuration
 ) -> ErrorHistory:
-    """Of the positions among judged epochs."""
+    """The history of those epochs that have a position."""
     positions = epochs.where(np.flatnonzero(epochs.positioned))
     jumps = jumps_of(positions, odometry, crossing_gaps_ns(positions.t_ns, config.lds), config.hazards)
-    return history_of(positions, offers, jumps, config)
+    return history_of_positions(positions, offers, jumps, config)
 
 
-def history_of(
+def history_of_positions(
     positions: JudgedEpochs, offers: JudgedOffers, jumps: Sequence[Jump], config: Configuration
 ) -> ErrorHistory:
-    """Of judged positions; `jumps` in their numbers."""
+    """The history of judged positions, with the jumps between them (numbered as these positions) and the offers."""
     completing = np.searchsorted(positions.epoch, offers.epoch)
     return ErrorHistory(
         positions=positions,
@@ -178,7 +188,7 @@ def history_of(
 
 
 def _settled_from(t_ns: Ints, judged: Judgements, config: HazardConfig) -> Ints:
-    """From each position on the first that begins `episode_end_s` within half the limit."""
+    """Per position the number of the first one from there on that begins `episode_end_s` within half the limit."""
     settled = (judged.largest_m <= config.limits.settled_m) & ~judged.is_wrong
     hold_ns = round(config.episode_end_s * NS_PER_S)
     begins = np.full(t_ns.size, t_ns.size)
@@ -190,7 +200,7 @@ def _settled_from(t_ns: Ints, judged: Judgements, config: HazardConfig) -> Ints:
 
 
 def _is_within_noise(judged: Judgements, sigma_m: Floats, config: HazardConfig) -> Bools:
-    """|e| at most min(3 sqrt(sigma_x^2 + sigma_ref^2), half the limit)."""
+    """Positions at which noise explains the error: |e| <= min(3 sqrt(sigma_x^2 + sigma_ref^2), half the limit)."""
     sigma_ref_m = np.nan_to_num(judged.half_m) / config.evidence_factor
     noise_m = config.evidence_factor * np.hypot(np.nan_to_num(sigma_m), sigma_ref_m)
     within = np.less_equal(np.abs(judged.middle_m), np.minimum(noise_m, config.limits.settled_m))
@@ -240,30 +250,30 @@ def find_failures(history: ErrorHistory) -> list[Failure]:
     failures: list[Failure] = []
     for part in np.split(wrong, np.flatnonzero(apart & settled_between) + 1):
         begin = history.after_noise(failures[-1].end if failures else 0, int(part[0]))
-        failures.append(failure_at(history, begin, int(history.settled_from[part[-1]]), part))
+        failures.append(failure_between(history, begin, int(history.settled_from[part[-1]]), part))
     return failures
 
 
-def failure_at(history: ErrorHistory, begin: int, end: int, wrong: Ints) -> Failure:
-    """Positions `begin` to `end` as a failure; `wrong`: those judged wrong in use, maybe none."""
+def failure_between(history: ErrorHistory, begin: int, end: int, wrong: Ints) -> Failure:
+    """The failure of positions `begin` to `end` with its times; `wrong`: those judged wrong in use, maybe none."""
     positions = history.positions
     hazardous_s, natural_s = (float(time_s[wrong].sum()) for time_s in (positions.wrong_s, positions.natural_s))
     may_be_wrong = ~history.judged.is_right[begin:end]
     may_s = float(positions.used_s[begin:end][may_be_wrong].sum())
     accepted = history.worst_accepted(begin, end)
-    within = within_budget(hazardous_s, may_s, accepted, history.config.budget_s)
+    within = keeps_budget(hazardous_s, may_s, accepted, history.config.budget_s)
     first, last = (int(wrong[0]), int(wrong[-1])) if wrong.size else (begin, end)
     return Failure(begin, first, last, end, hazardous_s, natural_s, may_s, accepted, within)
 
 
-def failures_within(epochs: JudgedEpochs, offers: JudgedOffers, config: Configuration) -> list[Failure]:
-    """The failures of a part of the epochs judged, as if it were all."""
+def failures_of_part(epochs: JudgedEpochs, offers: JudgedOffers, config: Configuration) -> list[Failure]:
+    """The failures of some of the judged epochs, as if these were the whole run."""
     positions = epochs.where(np.flatnonzero(epochs.positioned))
-    return find_failures(history_of(positions, offers, (), config))
+    return find_failures(history_of_positions(positions, offers, (), config))
 
 
-def within_budget(hazardous_s: float, hazardous_may_s: float, accepted: Judgement, budget_s: float) -> bool | None:
-    """Whether the allowed T_D was kept: not where a VB was accepted wrong; null where nobody knows."""
+def keeps_budget(hazardous_s: float, hazardous_may_s: float, accepted: Judgement, budget_s: float) -> bool | None:
+    """Whether the allowed T_D was kept (never with a VB accepted wrong); None where the evidence cannot say."""
     if accepted is Judgement.WRONG or hazardous_s > budget_s:
         return False
     return True if hazardous_may_s <= budget_s and accepted is Judgement.RIGHT else None

@@ -11,8 +11,8 @@ import polars as pl
 
 from pipeline.stages.epochs.clock import reactions_ns
 from pipeline.stages.evidence.evidence import KINDS
-from pipeline.stages.judge.episodes import Episode, suspect_of
-from pipeline.stages.judge.epochs import speed_at
+from pipeline.stages.judge.episodes import Episode, suspected_source
+from pipeline.stages.judge.epochs import speed_at_mps
 from pipeline.stages.judge.failures import ErrorHistory, Jump
 from pipeline.stages.judge.judged import JudgedEpochs, JudgedOffers
 from pipeline.stages.judge.judgement import JudgeInput
@@ -50,49 +50,50 @@ def hazard_rows(episodes: Iterable[Episode], history: ErrorHistory) -> list[Haza
     Source:
         DIAG, VB Jump and VB Shift; DOMAIN section 5.3.
     """
-    return [row for episode in episodes for row in _of_episode(episode, history)]
+    return [row for episode in episodes for row in _rows_of_episode(episode, history)]
 
 
-def _of_episode(episode: Episode, history: ErrorHistory) -> list[HazardRow]:
-    by_class = _jumps(episode, history)
+def _rows_of_episode(episode: Episode, history: ErrorHistory) -> list[HazardRow]:
+    """Rows of one episode: of each class of jump, of shifts, of wrong tracks, and of the jump back."""
+    by_class = _jump_rows(episode, history)
     crossed = {hit for row in by_class.values() for hit in row.crossed}
-    for hit in _hits(episode, history):
+    for hit in _wrong_offers(episode, history):
         if hit not in crossed:
             on_other_track = history.offers.judged.wrong_track[hit]
             hazard = Hazard.VB_WRONG_TRACK if on_other_track else min(by_class.keys() & _JUMPS, default=Hazard.VB_SHIFT)
             by_class.setdefault(hazard, HazardRow(hazard, episode)).hits.append(hit)
-    rows = sorted(by_class.values(), key=lambda row: t_hazard_ns(row, history))
+    rows = sorted(by_class.values(), key=lambda row: hazard_instant_ns(row, history))
     back = episode.jump_back
-    crossed_back = [] if back is None else crossed_by(back, history)
+    crossed_back = [] if back is None else crossed_by_jump(back, history)
     if crossed_back:
-        hazard = _class_of(crossed_back, history.offers)
+        hazard = _jump_class(crossed_back, history.offers)
         rows.append(HazardRow(hazard, episode, back, crossed_back, crossed_back, next(iter(rows), None)))
     return rows
 
 
-def _jumps(episode: Episode, history: ErrorHistory) -> dict[Hazard, HazardRow]:
+def _jump_rows(episode: Episode, history: ErrorHistory) -> dict[Hazard, HazardRow]:
     """A row per class of jump; VBs crossed later by a jump of the same class are appended."""
     rows: dict[Hazard, HazardRow] = {}
     for jump in history.jumps_in(episode.onset, episode.end):
-        crossed = crossed_by(jump, history)
+        crossed = crossed_by_jump(jump, history)
         if crossed:
-            hazard = _class_of(crossed, history.offers)
+            hazard = _jump_class(crossed, history.offers)
             row = rows.setdefault(hazard, HazardRow(hazard, episode, jump))
             row.hits += crossed
             row.crossed += crossed
     return rows
 
 
-def _hits(episode: Episode, history: ErrorHistory) -> list[int]:
-    """Offers judged wrong during the episode, beyond the shift limit or on another track."""
+def _wrong_offers(episode: Episode, history: ErrorHistory) -> list[int]:
+    """Numbers of the offers judged wrong in the episode that lie beyond the shift limit or on another track."""
     offers = history.offers
     beyond = (offers.judged.least_m > history.config.hazards.limits.shift_m) | offers.judged.wrong_track
     wrong = offers.offered & offers.judged.is_wrong & history.offers_between(episode.onset, episode.end)
     return np.flatnonzero(beyond & wrong).tolist()
 
 
-def crossed_by(jump: Jump, history: ErrorHistory) -> list[int]:
-    """Virtual balises between the ends of a jump that the train's own step does not cross."""
+def crossed_by_jump(jump: Jump, history: ErrorHistory) -> list[int]:
+    """Numbers of the virtual balises between the ends of a jump that the train's own step does not cross."""
     offers = history.offers
     between = np.flatnonzero(offers.virtual & history.offers_between(jump.first, jump.last + 1))
     if between.size == 0:
@@ -108,23 +109,26 @@ def crossed_by(jump: Jump, history: ErrorHistory) -> list[int]:
     return [hit for hit in between.tolist() if not low_m <= offers.path_m[hit] <= high_m]
 
 
-def _class_of(crossed: list[int], offers: JudgedOffers) -> Hazard:
-    return Hazard.VB_JUMP_1A if len(_names(crossed, offers)) > 1 else Hazard.VB_JUMP_1B
+def _jump_class(crossed: list[int], offers: JudgedOffers) -> Hazard:
+    """1A where a jump crosses several balises, 1B where it crosses one."""
+    return Hazard.VB_JUMP_1A if len(_balise_names(crossed, offers)) > 1 else Hazard.VB_JUMP_1B
 
 
-def _names(hits: list[int], offers: JudgedOffers) -> list[str]:
+def _balise_names(hits: list[int], offers: JudgedOffers) -> list[str]:
+    """Balises of some offers in order, each once."""
     return list(dict.fromkeys(offers.balise_id[hit] for hit in hits))
 
 
-def t_hazard_ns(row: HazardRow, history: ErrorHistory) -> int:
-    """The step, or the offered crossing of the first VB hit."""
+def hazard_instant_ns(row: HazardRow, history: ErrorHistory) -> int:
+    """Instant of the hazard [ns]: the jump, or the offered crossing of the first VB hit."""
     return int(history.offers.t_ns[row.hits[0]] if row.jump is None else history.t_ns[row.jump.first])
 
 
-def size_m(row: HazardRow, history: ErrorHistory) -> float | None:
-    """The largest |e| of the episode with its sign, by the interval's centre; of a jump back the error that it ended.
+def hazard_size_m(row: HazardRow, history: ErrorHistory) -> float | None:
+    """Error [m], with its sign, of largest size in the episode; of a jump back the error that it ended.
 
-    The step of a jump serves where no place along the track can be compared with the evidence.
+    By the middle of the interval. Where no place along the track can be compared with the evidence, the step of the
+    jump.
     """
     episode = row.episode
     jump = row.jump
@@ -138,7 +142,7 @@ def size_m(row: HazardRow, history: ErrorHistory) -> float | None:
     return float(error_m[np.argmax(np.abs(error_m))]) if error_m.size else None
 
 
-def rate_mps(row: HazardRow, history: ErrorHistory) -> float | None:
+def error_growth_mps(row: HazardRow, history: ErrorHistory) -> float | None:
     """Slope of the error from onset to failure [m/s], by the interval's centre; None for a step."""
     episode = row.episode
     if episode.step is not None or row.jump is not None:
@@ -173,31 +177,31 @@ def hazards_table(
             "solution": given.solution.name,
             "hazard_id": number,
             "caused_by": ids.get(id(row.caused_by)),
-            "suspect": suspect_of(epochs, row.episode.onset_ns, row.episode.end_ns, given.config).value,
-            "size_m": size_m(row, history),
-            "rate_mps": rate_mps(row, history),
-            "evidence": _evidence(row, history).value,
+            "suspect": suspected_source(epochs, row.episode.onset_ns, row.episode.end_ns, given.config).value,
+            "size_m": hazard_size_m(row, history),
+            "rate_mps": error_growth_mps(row, history),
+            "evidence": _evidence_of_row(row, history).value,
             "hazardous_s": row.episode.failure.hazardous_s,
             "hazardous_may_s": row.episode.failure.hazardous_may_s,
             "budget_s": given.config.budget_s,
             "within_budget": row.episode.failure.within_budget,
-            **_kind(row, history.offers),
-            **instants(row, history),
-            **_place(row, given, epochs, history),
+            **_class_columns(row, history.offers),
+            **instant_columns(row, history),
+            **_place_columns(row, given, epochs, history),
         }
         for number, row in enumerate(rows)
     ]
     return table_of_rows(values, dtypes(Hazards))
 
 
-def _kind(row: HazardRow, offers: JudgedOffers) -> Row:
-    """Class, failure mode and timing, and the VBs hit; accepted ones by their own list."""
+def _class_columns(row: HazardRow, offers: JudgedOffers) -> Row:
+    """Columns of class, failure mode, timing, and of the VBs hit and accepted."""
     error_m = float(offers.judged.middle_m[row.hits[0]])
     timing = Timing.EARLY if error_m > 0.0 else Timing.LATE if error_m < 0.0 else Timing.NONE
     mode = FailureMode.INSERTION
     if row.hazard is Hazard.VB_SHIFT and timing is not Timing.EARLY:
         mode = FailureMode.DELETION if offers.beyond_window[row.hits].any() else FailureMode.NONE
-    names = _names(row.hits, offers)
+    names = _balise_names(row.hits, offers)
     accepted = {offers.balise_id[hit] for hit in row.hits if offers.accepted[hit]}
     return {
         "hazard": row.hazard.value,
@@ -208,50 +212,52 @@ def _kind(row: HazardRow, offers: JudgedOffers) -> Row:
     }
 
 
-def _evidence(row: HazardRow, history: ErrorHistory) -> Evidence:
-    """What the judgement of the first VB hit rests on, else that of the mark; the odometer where nothing else is."""
+def _evidence_of_row(row: HazardRow, history: ErrorHistory) -> Evidence:
+    """Evidence behind the judgement of the first VB hit, else of the first wrong position; else the odometer."""
     kinds = (history.offers.judged.kind[row.hits[0]], history.judged.kind[row.episode.mark])
     return next((KINDS[kind] for kind in kinds if kind >= 0), Evidence.ODOMETER)
 
 
-def instants(row: HazardRow, history: ErrorHistory) -> Row:
-    """When it began, hit, failed, was detected and ended, and the times between (DIAG, T_D and T_dsf)."""
+def instant_columns(row: HazardRow, history: ErrorHistory) -> Row:
+    """Columns of onset, hazard, failure, detection, negation and end, and the times between (DIAG, T_D and T_dsf)."""
     episode = row.episode
     detected_ns = episode.detection.t_ns
     failed_ns = None if episode.failed is None else int(history.t_ns[episode.failed])
     return {
         "t_onset": episode.onset_ns,
-        "t_hazard": t_hazard_ns(row, history),
+        "t_hazard": hazard_instant_ns(row, history),
         "t_failure": failed_ns,
         "t_failure_may": episode.may_ns,
         "t_detected": detected_ns,
-        "t_negated": None if detected_ns is None else _negated_ns(detected_ns, history),
+        "t_negated": None if detected_ns is None else _negation_ns(detected_ns, history),
         "t_end": episode.end_ns,
         "monitor": episode.detection.monitor,
         "detected": detected_ns is not None,
         "alarm_before_onset": episode.detection.standing,
-        "time_to_detect_s": _seconds(episode.onset_ns, detected_ns),
-        "time_since_failure_s": _seconds(failed_ns, detected_ns),
-        "time_since_failure_may_s": _seconds(episode.may_ns, detected_ns),
+        "time_to_detect_s": _seconds_between(episode.onset_ns, detected_ns),
+        "time_since_failure_s": _seconds_between(failed_ns, detected_ns),
+        "time_since_failure_may_s": _seconds_between(episode.may_ns, detected_ns),
     }
 
 
-def _negated_ns(detected_ns: int, history: ErrorHistory) -> int:
+def _negation_ns(detected_ns: int, history: ErrorHistory) -> int:
+    """Instant of negation [ns]: detection and the time to react."""
     return detected_ns + int(reactions_ns(np.array([detected_ns]), history.t_ns, history.config)[0])
 
 
-def _seconds(begin_ns: int | None, end_ns: int | None) -> float | None:
+def _seconds_between(begin_ns: int | None, end_ns: int | None) -> float | None:
+    """Time from one instant to another [s]; None where either is not known."""
     return None if begin_ns is None or end_ns is None else (end_ns - begin_ns) / NS_PER_S
 
 
-def _place(row: HazardRow, given: JudgeInput, epochs: JudgedEpochs, history: ErrorHistory) -> Row:
-    """Where the train was at the hazard, and how fast it went; null where nobody knows."""
+def _place_columns(row: HazardRow, given: JudgeInput, epochs: JudgedEpochs, history: ErrorHistory) -> Row:
+    """Columns of the train's place and speed at the hazard; None where not known."""
     number = int(history.completing[row.hits[0]]) if row.jump is None else row.jump.first
     positions = history.positions
     away_m = int(positions.direction[number]) * float(positions.judgements.middle_m[number])
     path_m = float(positions.path_m[number]) - away_m
     names, measures_m = given.solution.path.locate(max(int(positions.leg[number]), 0), path_m)
-    speed_mps = speed_at(epochs, np.array([t_hazard_ns(row, history)]))
+    speed_mps = speed_at_mps(epochs, np.array([hazard_instant_ns(row, history)]))
     figures = {"measure_m": measures_m[0], "path_m": path_m, "speed_mps": speed_mps[0]}
     known = {name: None if np.isnan(value) else float(value) for name, value in figures.items()}
     return {"netelement_id": names[0], **known}

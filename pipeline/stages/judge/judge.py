@@ -1,4 +1,4 @@
-"""When the train itself passed each balise, by the evidence alone (CONTRACT section 3, `t_true`)."""
+"""The judge of one solution; its passages with the train's own crossings (CONTRACT section 3, `t_true`)."""
 
 from __future__ import annotations
 
@@ -14,8 +14,8 @@ from pipeline.stages.epochs.clock import crossing_gaps_ns, passings
 from pipeline.stages.epochs.verdicts import failure_log
 from pipeline.stages.evidence.evidence import KINDS, NOTHING, Alternative, EvidenceSet, Span, within_spans
 from pipeline.stages.judge.episodes import alarms_table, find_episodes
-from pipeline.stages.judge.epochs import judged_epochs, judged_offers, odometer_steps, speed_at
-from pipeline.stages.judge.failures import Failure, error_history_of, find_failures
+from pipeline.stages.judge.epochs import judged_epochs, judged_offers, odometer_steps, speed_at_mps
+from pipeline.stages.judge.failures import Failure, error_history, find_failures
 from pipeline.stages.judge.hazards import HazardRow, hazard_rows, hazards_table
 from pipeline.stages.judge.judged import JudgedEpochs, JudgedOffers
 from pipeline.stages.judge.judgement import JudgeInput
@@ -71,7 +71,7 @@ def crossings_of(given: JudgeInput) -> Crossings:
     elements = [index.get(name, -1) for name in balises["netelement_id"]]
     spots = zip(balises["balise_id"], elements, balises["measure_m"], strict=True)
     places = {name: Place(element, measure_m) for name, element, measure_m in spots}
-    at_ns = between_far_epochs(given.instants_of_epochs(), given.config.align.speed_window_s)
+    at_ns = with_instants_between(given.epochs_valid_at_ns(), given.config.align.speed_window_s)
     crossings = true_crossings(at_ns, given.evidence.at(at_ns), places, given.config)
     # `valid_direction` is along the path, `sense` of a crossing along the measure; 0 is both directions.
     valid = dict(balises.select("balise_id", pl.col("valid_direction") * pl.col("sense")).iter_rows())
@@ -81,8 +81,8 @@ def crossings_of(given: JudgeInput) -> Crossings:
     }
 
 
-def between_far_epochs(at_ns: Ints, step_s: float) -> Ints:
-    """The instants of the positions, and others between those that are far apart."""
+def with_instants_between(at_ns: Ints, step_s: float) -> Ints:
+    """The instants of the positions [ns], and others every `step_s` between those that are farther apart."""
     step_ns = round(step_s * NS_PER_S)
     far = np.flatnonzero(np.diff(at_ns) > 1.5 * step_ns)
     gaps = zip(at_ns[far].tolist(), at_ns[far + 1].tolist(), strict=True)
@@ -100,7 +100,7 @@ class _Train(NamedTuple):
 
 
 def true_crossings(t_ns: Ints, evidence: EvidenceSet, places: dict[str, Place], config: Configuration) -> Crossings:
-    """Crossings where the evidence leaves one track; `t_ns`: of the evidence.
+    """Crossings of balises at `places` by the train, where the evidence (at instants `t_ns`) leaves one track.
 
     Where the half interval is at most `known_error_m`, its middle counts; else the whole interval has to pass from one
     side of the balise to the other.
@@ -120,18 +120,18 @@ def true_crossings(t_ns: Ints, evidence: EvidenceSet, places: dict[str, Place], 
     for track in tracks:
         if track.rows.size == 0:
             continue
-        rows, at_m = _with_neighbours(track, train)
+        rows, at_m = _rows_about_track(track, train)
         on_track = np.isin(rows, track.rows)
         for balise, visit_m, sense in zip(*track.route.places(elements, measures_m), strict=True):
             if at_m.min() <= visit_m <= at_m.max():
-                crossed = _crossed(train, rows, on_track, at_m - visit_m, config)
+                crossed = _crossings_of_place(train, rows, on_track, at_m - visit_m, config)
                 turned = [crossing._replace(sense=int(crossing.sense * sense)) for crossing in crossed]
                 crossings[names[balise]] += turned
     return {name: sorted(crossed) for name, crossed in crossings.items()}
 
 
-def _with_neighbours(track: Alternative, train: _Train) -> tuple[Ints, Floats]:
-    """Rows and coordinates on a track, also of the rows just before and after, where the train's place lies on it."""
+def _rows_about_track(track: Alternative, train: _Train) -> tuple[Ints, Floats]:
+    """Rows of the train on a track and of the instants just before and after, with their coordinates on it [m]."""
     rows = track.rows
     around = np.arange(max(rows[0] - _NEIGHBOURS, 0), min(rows[-1] + _NEIGHBOURS + 1, train.t_ns.size))
     neighbours = np.setdiff1d(around, rows)
@@ -144,8 +144,10 @@ def _with_neighbours(track: Alternative, train: _Train) -> tuple[Ints, Floats]:
     return both[order], np.concatenate([track.middle_m, there_m[known]])[order]
 
 
-def _crossed(train: _Train, rows: Ints, on_track: Bools, away_m: Floats, config: Configuration) -> list[TrueCrossing]:
-    """Instants, the later one `on_track`, at which the train went from one side of the balise to the other.
+def _crossings_of_place(
+    train: _Train, rows: Ints, on_track: Bools, away_m: Floats, config: Configuration
+) -> list[TrueCrossing]:
+    """The train's crossings of one balise, `away_m` from it, at those of the rows that are `on_track`.
 
     A train that came no farther than `rearm_m` from a balise since it passed it has not passed it again.
     """
@@ -199,34 +201,34 @@ def passages_table(
     """
     stamps = epochs.t_ns[epochs.positioned]
     crossings = crossings_of(given)
-    known = given.solution.passages.with_columns(_true_times(given.solution.passages, crossings))
-    passages = _with_unoffered(known, given, crossings, stamps)
+    known = given.solution.passages.with_columns(_take_true_times(given.solution.passages, crossings))
+    passages = _with_unoffered_passages(known, given, crossings, stamps)
     t_true = passages["t_true"]
-    virtual = _are(passages["kind"], BaliseKind.VIRTUAL)
-    accepted = virtual & _are(passages["status"], PassageStatus.ACCEPTED)
+    virtual = _equal_to(passages["kind"], BaliseKind.VIRTUAL)
+    accepted = virtual & _equal_to(passages["status"], PassageStatus.ACCEPTED)
     offered_ns = ints(passages["t_offered"].dt.timestamp("ns"))
-    positioned = _within_gap(stamps, ints(t_true), given.config.lds) & t_true.is_not_null().to_numpy()
-    of_offers, inserted = _of_offers(passages, offers, rows)
+    positioned = _is_interpolated(stamps, ints(t_true), given.config.lds) & t_true.is_not_null().to_numpy()
+    of_offers, inserted = _offer_columns(passages, offers, rows)
     frame = passages.with_columns(
         t_true.cast(pl.Datetime("ns", "UTC")),
         *of_offers,
-        _speeds(passages, t_true, epochs, given.config.lds),
+        _passage_speeds_mps(passages, t_true, epochs, given.config.lds),
         pl.Series("suspect_after_the_fact", accepted & within_spans(offered_ns, undetected)),
     )
-    return frame.with_columns(failures_of(frame, inserted, positioned)).select(Passages.column_names())
+    return frame.with_columns(failure_columns(frame, inserted, positioned)).select(Passages.column_names())
 
 
-def _are(words: pl.Series, word: StrEnum) -> Bools:
-    """Where a column of words has this one; null is false."""
+def _equal_to(words: pl.Series, word: StrEnum) -> Bools:
+    """Rows at which a column of words holds this one; null is false."""
     return truths(words == word.value)
 
 
-def _of_offers(
+def _offer_columns(
     passages: pl.DataFrame, offers: JudgedOffers, rows: Sequence[HazardRow]
 ) -> tuple[list[pl.Series], Bools]:
-    """Judgement, error and hazard from the offer of each passage, from a telegram its error alone; what was inserted.
+    """Columns of judgement, error and hazard of the offer of each passage, and which passages are insertions.
 
-    Inserted: by a jump, on another track, or early and wrong.
+    Of a telegram the error alone. Inserted: by a jump, on another track, or early and wrong.
     """
     judged = offers.judged
     hazard = np.full(offers.size, NOTHING)
@@ -236,24 +238,24 @@ def _of_offers(
         inserted[row.crossed] = True
     place = {crossing: number for number, crossing in enumerate(offers.crossing_id.tolist())}
     at = np.array([place.get(crossing, NOTHING) for crossing in passages["crossing_id"]], dtype=np.int64)
-    of_offer = _known(at)
-    of_virtual = _known(np.where(np.append(offers.virtual, False)[at], at, NOTHING))
+    of_offer = _null_for_nothing(at)
+    of_virtual = _null_for_nothing(np.where(np.append(offers.virtual, False)[at], at, NOTHING))
     columns = [
         pl.Series("location_error_m", offers.location_error_m, nan_to_null=True).gather(of_offer),
-        _known(hazard).alias("hazard_id").gather(of_offer),
+        _null_for_nothing(hazard).alias("hazard_id").gather(of_offer),
         *(column.gather(of_virtual) for column in judged.columns()),
         pl.Series("proof_margin_m", offers.proof_margin_m, nan_to_null=True).gather(of_virtual),
     ]
     return columns, np.append(inserted, False)[at]
 
 
-def _known(numbers: Ints) -> pl.Series:
+def _null_for_nothing(numbers: Ints) -> pl.Series:
     """Numbers as a column, null for `NOTHING`."""
     return pl.Series(numbers, dtype=pl.Int64).replace(NOTHING, None)
 
 
-def _true_times(passages: pl.DataFrame, crossings: Crossings) -> pl.Series:
-    """The train's crossing of each passage [ns], taken out of `crossings`: the nearest to its offer or reckoning.
+def _take_true_times(passages: pl.DataFrame, crossings: Crossings) -> pl.Series:
+    """The train's crossing of each passage [ns], taken out of `crossings`; the nearest to its offer or reckoning.
 
     A passage with neither takes what is left, in order.
     """
@@ -276,8 +278,8 @@ def _true_times(passages: pl.DataFrame, crossings: Crossings) -> pl.Series:
     return pl.Series("t_true", times, dtype=pl.Int64)
 
 
-def _within_gap(stamps: Ints, t_ns: Ints, lds: LdsConfig) -> Bools:
-    """Positions on both sides of each instant, no farther apart than a crossing is interpolated over."""
+def _is_interpolated(stamps: Ints, t_ns: Ints, lds: LdsConfig) -> Bools:
+    """Whether positions lie on both sides of each instant, no farther apart than a crossing is interpolated over."""
     if stamps.size < 2:
         return np.zeros(t_ns.size, dtype=np.bool_)
     after = np.searchsorted(stamps, t_ns).clip(1, stamps.size - 1)
@@ -285,44 +287,46 @@ def _within_gap(stamps: Ints, t_ns: Ints, lds: LdsConfig) -> Bools:
     return np.asarray(inside & (stamps[after] - stamps[after - 1] <= crossing_gaps_ns(stamps, lds)[after]))
 
 
-def _speeds(passages: pl.DataFrame, t_true: pl.Series, epochs: AlignedEpochs, lds: LdsConfig) -> pl.Series:
+def _passage_speeds_mps(passages: pl.DataFrame, t_true: pl.Series, epochs: AlignedEpochs, lds: LdsConfig) -> pl.Series:
     """Speed of the train at the offer, else where it passed [m/s]; null in a gap of the epochs."""
     at = passages["t_offered"].dt.timestamp("ns").fill_null(t_true)
     stamps = epochs.t_ns[np.isfinite(epochs.speed_mps)]
-    known = at.is_not_null().to_numpy() & _within_gap(stamps, ints(at), lds)
-    return pl.Series("speed_mps", np.where(known, speed_at(epochs, ints(at)), np.nan), nan_to_null=True)
+    known = at.is_not_null().to_numpy() & _is_interpolated(stamps, ints(at), lds)
+    return pl.Series("speed_mps", np.where(known, speed_at_mps(epochs, ints(at)), np.nan), nan_to_null=True)
 
 
-def failures_of(passages: pl.DataFrame, inserted: Bools, positioned: Bools) -> list[pl.Series]:
-    """ETCS failure mode and cause of each passage; shape (passages,).
+def failure_columns(passages: pl.DataFrame, inserted: Bools, positioned: Bools) -> list[pl.Series]:
+    """Columns of the ETCS failure mode and its cause, of each passage.
 
     Insertion where offered where it is not, deletion where not offered in time. `inserted`: by what the judge says of
     the offer; `positioned`: the train had positions where it passed.
     """
     beyond_window = truths(passages["odometer_distance_m"] > passages["window_close_m"])
     offered = passages["t_offered"].is_not_null().to_numpy()
-    wrong = _are(passages["judgement"], Judgement.WRONG)
-    absent = _are(passages["status"], PassageStatus.NOT_AVAILABLE)
+    wrong = _equal_to(passages["judgement"], Judgement.WRONG)
+    absent = _equal_to(passages["status"], PassageStatus.NOT_AVAILABLE)
     insertion = offered & inserted
     deletion = absent | ~offered | beyond_window
     by_position = insertion | (beyond_window & wrong) | (~offered & ~absent & positioned)
     without = absent | (~offered & ~positioned)
     modes: dict[StrEnum, Bools] = {FailureMode.INSERTION: insertion, FailureMode.DELETION: deletion}
     causes: dict[StrEnum, Bools] = {Cause.POSITION: by_position, Cause.NO_POSITION: without}
-    return [_first_of("failure_mode", modes, FailureMode.NONE), _first_of("cause", causes, Cause.NONE)]
+    return [_first_word("failure_mode", modes, FailureMode.NONE), _first_word("cause", causes, Cause.NONE)]
 
 
-def _first_of(name: str, conditions: Mapping[StrEnum, Bools], otherwise: StrEnum) -> pl.Series:
-    """The word of the first condition that holds."""
+def _first_word(name: str, conditions: Mapping[StrEnum, Bools], otherwise: StrEnum) -> pl.Series:
+    """A column of words: of each row that of the first condition that holds."""
     words = [*conditions, otherwise]
     first = np.select(list(conditions.values()), range(len(conditions)), default=len(conditions))
     return pl.Series(name, [words[number].value for number in first], dtype=dtypes(Passages)[name])
 
 
-def _with_unoffered(passages: pl.DataFrame, given: JudgeInput, crossings: Crossings, stamps: Ints) -> pl.DataFrame:
-    """Adds a passage for each true crossing of a virtual balise without one: the LDS, misled by the position, has none.
+def _with_unoffered_passages(
+    passages: pl.DataFrame, given: JudgeInput, crossings: Crossings, stamps: Ints
+) -> pl.DataFrame:
+    """The passages, and one for each true crossing of a virtual balise that the LDS knows nothing of.
 
-    `crossings`: those that belong to no passage; `stamps`: of valid positions.
+    `crossings`: those that belong to no passage; `stamps`: of valid positions [ns].
     """
     virtual = given.solution.balises.filter(pl.col("kind").cast(pl.String) == BaliseKind.VIRTUAL.value)
     missed = [
@@ -334,16 +338,19 @@ def _with_unoffered(passages: pl.DataFrame, given: JudgeInput, crossings: Crossi
     if not missed:
         return passages
     times = np.array([crossing.t_ns for _, crossing in missed])
-    positioned = _within_gap(stamps, times, given.config.lds).tolist()
-    rows = [_unoffered(*pair, given.solution.name, known) for pair, known in zip(missed, positioned, strict=True)]
+    positioned = _is_interpolated(stamps, times, given.config.lds).tolist()
+    rows = [_unoffered_row(*pair, given.solution.name, known) for pair, known in zip(missed, positioned, strict=True)]
     added = pl.DataFrame(rows, schema=passages.schema)
     when = pl.coalesce("t_offered", "t_reckoned")
     ordered = passages.with_columns(_when=when.forward_fill().backward_fill())
     return pl.concat([ordered, added.with_columns(_when=when)]).sort("_when", maintain_order=True).drop("_when")
 
 
-def _unoffered(balise: dict[str, Any], crossing: TrueCrossing, solution: str, positioned: bool) -> dict[str, Any]:
-    """The row of such a passage; `sense` of crossing and balise are along the measure, `direction` along the path."""
+def _unoffered_row(balise: dict[str, Any], crossing: TrueCrossing, solution: str, positioned: bool) -> dict[str, Any]:
+    """The row of a passage that was not offered; `positioned`: the train had positions where it passed.
+
+    `sense` of crossing and balise are along the measure, `direction` along the path.
+    """
     names = ("balise_id", "kind", "netelement_id", "measure_m", "path_m", "location_accuracy_m")
     growing = crossing.sense * balise["sense"] > 0
     return {name: balise[name] for name in names} | {
@@ -393,13 +400,13 @@ def judge(given: JudgeInput) -> Judged:
     given = replace(given, evidence=replace(given.evidence, standstills=steps.standstills))
     epochs = judged_epochs(given, steps)
     offers = judged_offers(given, epochs)
-    history = error_history_of(epochs, offers, given.odometry, config)
+    history = error_history(epochs, offers, given.odometry, config)
     failures = find_failures(history)
     log = failure_log(epochs.t_ns, epochs.negated, epochs.verdicts, config.lds.recovery_s)
     episodes = find_episodes(history, failures, log, given.faults)
     rows = hazard_rows(episodes, history)
     # From a fault's onset to its detection.
-    undetected = [episode.undetected_ns for episode in episodes]
+    undetected = [episode.undetected_span_ns for episode in episodes]
     return Judged(
         hazards=hazards_table(rows, given, epochs, history),
         alarms=alarms_table(given.solution.name, epochs, log, [row.episode for row in rows], config),
@@ -408,13 +415,13 @@ def judge(given: JudgeInput) -> Judged:
         epochs=epochs,
         offers=offers,
         suspect_after_the_fact=within_spans(epochs.t_ns, undetected) & epochs.tvb,
-        distance_m=_distance_m(given, epochs),
-        evidence=_evidence(epochs.judgements.kind),
+        distance_m=_driven_distance_m(given, epochs),
+        evidence=_main_evidence(epochs.judgements.kind),
     )
 
 
-def _distance_m(given: JudgeInput, epochs: JudgedEpochs) -> float | None:
-    """Way driven: by the odometer, else by the reference, else by the positions; None where none of them shows it."""
+def _driven_distance_m(given: JudgeInput, epochs: JudgedEpochs) -> float | None:
+    """Distance driven [m] by the odometer, else by the reference, else by the positions; None if none shows it."""
     if given.odometry is not None:
         begin_m, end_m = given.odometry.travelled_at(epochs.at_ns[[0, -1]]).tolist()
         return float(end_m - begin_m) * (given.odometry.scale or 1.0)
@@ -423,7 +430,7 @@ def _distance_m(given: JudgeInput, epochs: JudgedEpochs) -> float | None:
     return float(pl.Series(place_m).diff().abs().sum()) if place_m.size > 1 else None
 
 
-def _evidence(kinds: Ints) -> Evidence | None:
-    """What most epochs rest on; of equally many the first in the order of the enum."""
+def _main_evidence(kinds: Ints) -> Evidence | None:
+    """The kind of evidence that most epochs rest on; of equally many the first in the order of the enum."""
     counts = np.bincount(kinds[kinds != NOTHING], minlength=len(KINDS))
     return KINDS[int(counts.argmax())] if counts.any() else None

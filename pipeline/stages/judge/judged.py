@@ -45,7 +45,7 @@ class Judgements:
     track_assumed: Bools
 
     def at(self, rows: Rows) -> Judgements:
-        """Those of some instants."""
+        """The judgements of some instants, by row."""
         return Judgements(
             code=self.code[rows],
             low_m=self.low_m[rows],
@@ -56,7 +56,7 @@ class Judgements:
         )
 
     def columns(self) -> list[pl.Series]:
-        """As they stand in `epochs` and `passages`."""
+        """As columns of `epochs` and `passages`."""
         return [
             gathered(_JUDGEMENT_WORDS, self.code).alias("judgement"),
             pl.Series("error_low_m", self.low_m, nan_to_null=True),
@@ -65,50 +65,54 @@ class Judgements:
         ]
 
     def turned(self, direction: Ints) -> Judgements:
-        """With the errors in the direction of travel: +1 along growing path, -1 against it."""
+        """The same with errors in the direction of travel (+1 along growing path, -1 against it)."""
         forward = direction > 0
         low_m = np.where(forward, self.low_m, -self.high_m)
         return replace(self, low_m=low_m, high_m=np.where(forward, self.high_m, -self.low_m))
 
     @cached_property
     def is_right(self) -> Bools:
+        """Instants judged right."""
         return np.asarray(self.code == RIGHT)
 
     @cached_property
     def is_wrong(self) -> Bools:
+        """Instants judged wrong."""
         return np.asarray(self.code == WRONG)
 
     @cached_property
     def is_judged(self) -> Bools:
-        """The evidence calls the position right or wrong (DOMAIN section 5.2)."""
+        """Instants that the evidence calls right or wrong (DOMAIN section 5.2)."""
         return self.is_right | self.is_wrong
 
     @cached_property
-    def by_truth(self) -> Bools:
-        """By evidence that can call a position right: any but the odometer since an accepted VB."""
+    def rests_on_truth(self) -> Bools:
+        """Instants with evidence that can call a position right: any but the odometer since an accepted VB."""
         return np.asarray((self.kind >= 0) & (self.kind != ODOMETER))
 
     @cached_property
     def middle_m(self) -> Floats:
+        """Middle of the interval of the error [m]."""
         return 0.5 * (self.low_m + self.high_m)
 
     @cached_property
     def half_m(self) -> Floats:
+        """Half the width of the interval of the error [m]."""
         return 0.5 * (self.high_m - self.low_m)
 
     @cached_property
     def least_m(self) -> Floats:
-        """The smallest size that the error may have."""
+        """The smallest size that the error may have [m]."""
         return np.asarray(np.maximum(np.maximum(self.low_m, -self.high_m), 0.0))
 
     @cached_property
     def largest_m(self) -> Floats:
-        """The largest size that the error may have."""
+        """The largest size that the error may have [m]."""
         return np.asarray(np.maximum(-self.low_m, self.high_m))
 
-    def known_m(self, known_to_m: float) -> Floats:
-        """The error where reference or balise reads give it to plus or minus so much, else NaN [m]."""
-        return np.where(self.by_truth & (self.half_m <= known_to_m), self.middle_m, np.nan)
+    def known_error_m(self, known_to_m: float) -> Floats:
+        """The error where reference or balise reads give it to +- `known_to_m`, else NaN [m]."""
+        return np.where(self.rests_on_truth & (self.half_m <= known_to_m), self.middle_m, np.nan)
 
 
 @frozen
@@ -158,12 +162,12 @@ class JudgedEpochs(MonitoredEpochs):
 
     @property
     def valid(self) -> Bools:
-        """TVBs while it is known whether the train moves: a TVB where nobody knows counts for no availability."""
+        """Epochs with a TVB of which it is known whether the train moves; else a TVB counts for no availability."""
         return self.tvb & (self.moves | ~self.may_move)
 
     def series(self) -> list[pl.Series]:
         """All columns, for studies that read tables."""
-        return [*super().series(), *self._of_evidence()]
+        return [*super().series(), *self._evidence_series()]
 
     def contract_series(self) -> list[pl.Series]:
         """The columns of the `epochs` table that the judge knows."""
@@ -172,10 +176,11 @@ class JudgedEpochs(MonitoredEpochs):
             *(series_of(self, name) for name in arrays_of(type(self)) if name in of_table),
             self.solution_series(),
             *(column for name, one in self.verdicts.items() for column in one.columns(name)),
-            *self._of_evidence(),
+            *self._evidence_series(),
         ]
 
-    def _of_evidence(self) -> list[pl.Series]:
+    def _evidence_series(self) -> list[pl.Series]:
+        """Columns of judgement, true places and movement."""
         moving = np.where(self.may_move & ~self.moves, np.nan, self.moves)
         return [
             *self.judgements.columns(),
@@ -225,8 +230,8 @@ class JudgedOffers:
         return JudgedOffers(**parts, balise_id=names, judged=self.judged.at(rows))
 
     @classmethod
-    def of(cls, crossings: Crossings, rows: Ints, **judged: Any) -> JudgedOffers:
-        """Some of the crossings; `judged`: what the judge adds."""
+    def of_crossings(cls, crossings: Crossings, rows: Ints, **judged: Any) -> JudgedOffers:
+        """Some of the crossings as offers; `judged`: the fields that the judge adds."""
         return cls(
             crossing_id=rows,
             balise_id=[crossings.balise_id[row] for row in rows.tolist()],

@@ -1,4 +1,4 @@
-"""What is judged, and by what: one solution as it was replayed, with the evidence of its run."""
+"""Positions and offered balises against the evidence: right, wrong or unknown (DOMAIN section 5.2)."""
 
 from __future__ import annotations
 
@@ -58,21 +58,26 @@ class JudgeInput:
     leaps_s: tuple[int, ...] = ()
 
     def evidence_at(self, at_ns: Ints) -> EvidenceSet:
-        """Where the train was at instants of the positions' clock: by either clock, where that may be off by leaps."""
-        return either([self.evidence.at(clock_ns) for clock_ns in self.clocks_ns(at_ns)])
+        """Where the train was at instants of the positions' clock [ns].
 
-    def clocks_ns(self, at_ns: Ints) -> list[Ints]:
-        """The same instants of the positions' clock by each clock of the evidence that they may have."""
+        By either clock where that may be off by leaps.
+        """
+        return either([self.evidence.at(clock_ns) for clock_ns in self.on_possible_clocks_ns(at_ns)])
+
+    def on_possible_clocks_ns(self, at_ns: Ints) -> list[Ints]:
+        """The same instants on each clock of the evidence that they may be stamps of [ns]."""
         return [at_ns, *(at_ns + leap_s * NS_PER_S for leap_s in self.leaps_s)]
 
     def instants(self, t_ns: Ints) -> Ints:
-        """When positions of these stamps were true."""
+        """When positions of these stamps were true [ns]."""
         return valid_at_ns(t_ns, self.vehicle)
 
-    def instants_of_epochs(self) -> Ints:
+    def epochs_valid_at_ns(self) -> Ints:
+        """When the positions of the epochs were true [ns]."""
         return self.instants(self.solution.epochs.t_ns)
 
     def legs(self) -> list[RoutePath]:
+        """Legs of the solution's path, by the numbers of net elements that the evidence counts with."""
         return self.solution.path.routes(self.evidence.network.track.index)
 
 
@@ -95,7 +100,7 @@ class MatchedPositions:
     unambiguous: Bools
 
     @classmethod
-    def of(cls, epochs: AlignedEpochs, index: Mapping[str, int]) -> MatchedPositions:
+    def of_epochs(cls, epochs: AlignedEpochs, index: Mapping[str, int]) -> MatchedPositions:
         """The positions of epochs; `index`: numbers of net elements by name."""
         element = np.where(epochs.positioned, epochs.element_by(index), -1)
         return cls(element, epochs.measure_m, epochs.leg, epochs.path_m, epochs.unambiguous)
@@ -109,17 +114,20 @@ class MatchedPositions:
 
     @property
     def known(self) -> Bools:
+        """Which of them have a place on the network."""
         return np.isfinite(self.path_m) & np.greater_equal(self.element, 0)
 
 
-def margins_m(sigma_m: Floats, config: HazardConfig) -> Floats:
-    """Errors of a healthy position: max(5 m, min(3 sigma, failure limit))."""
+def healthy_margins_m(sigma_m: Floats, config: HazardConfig) -> Floats:
+    """Largest error of a healthy position [m]: max(5 m, min(3 sigma, failure limit))."""
     noise = np.minimum(config.evidence_factor * np.nan_to_num(sigma_m, nan=np.inf), config.limits.healthy_m)
     return np.maximum(config.false_alarm_margin_m, noise)
 
 
-def judgements_of(given: JudgeInput, positions: MatchedPositions, at_ns: Ints, evidence: EvidenceSet) -> Judgements:
-    """Positions against the evidence; where there is none, against the odometer since the last accepted VB."""
+def judge_with_odometer(
+    given: JudgeInput, positions: MatchedPositions, at_ns: Ints, evidence: EvidenceSet
+) -> Judgements:
+    """Judge positions by the evidence; where there is none, by the odometer since the last accepted VB."""
     judged = judge_positions(positions, evidence, given.legs(), given.config.hazards)
     if given.odometry is None:
         return judged
@@ -129,14 +137,16 @@ def judgements_of(given: JudgeInput, positions: MatchedPositions, at_ns: Ints, e
     place_m = crossings.path_m[crossings.accepted]
     own = [
         carried_forward(anchor_ns, place_m, clock_ns, given.odometry, standstills, given.config)
-        for anchor_ns, clock_ns in zip(given.clocks_ns(accepted_ns), given.clocks_ns(at_ns), strict=True)
+        for anchor_ns, clock_ns in zip(
+            given.on_possible_clocks_ns(accepted_ns), given.on_possible_clocks_ns(at_ns), strict=True
+        )
     ]
     # NaN, where one of the clocks leaves nothing known.
     low_m, high_m = np.min([low for low, _ in own], axis=0), np.max([high for _, high in own], axis=0)
     # Where it contradicts a reference, and nobody knows which of the two failed, it shows nothing.
     unsure = within_spans(at_ns, given.evidence.unsure)
     train_m = np.where(unsure, np.nan, low_m), np.where(unsure, np.nan, high_m)
-    return with_own_anchors(judged, positions, train_m, given.config.hazards)
+    return judge_by_own_anchors(judged, positions, train_m, given.config.hazards)
 
 
 def judge_positions(
@@ -166,11 +176,11 @@ def judge_positions(
     # True as long as it holds for every alternative seen so far.
     right, ahead, behind, elsewhere = np.ones((4, size), dtype=np.bool_)
     judged = np.zeros(size, dtype=np.bool_)
-    sense = _path_sense(positions, legs)
+    sense = _path_senses(positions, legs)
     for alternative in evidence.alternatives:
         there = alternative.where(positions.known[alternative.rows])
         rows = there.rows
-        least_m, most_m, off_track = _relative(positions, sense, there, legs)
+        least_m, most_m, off_track = _compare_with_alternative(positions, sense, there, legs)
         # On another track a position is wrong only if the match was sure of its own track.
         excluded = off_track & positions.unambiguous[rows]
         with np.errstate(invalid="ignore"):
@@ -195,7 +205,7 @@ def judge_positions(
     )
 
 
-def _path_sense(positions: MatchedPositions, legs: Sequence[RoutePath]) -> Ints:
+def _path_senses(positions: MatchedPositions, legs: Sequence[RoutePath]) -> Ints:
     """+1 where the path of the solution grows with the measure of the position's net element, else -1."""
     sense = np.ones(positions.element.size, dtype=np.int64)
     for number, leg in enumerate(legs):
@@ -209,8 +219,10 @@ _Relative = tuple[Floats, Floats, Bools]
 """Error interval along growing path (NaN: not known), and where the position is on another track."""
 
 
-def _relative(positions: MatchedPositions, sense: Ints, there: Alternative, legs: Sequence[RoutePath]) -> _Relative:
-    """Positions against one alternative: on its track, else by their own path where that leads to the train."""
+def _compare_with_alternative(
+    positions: MatchedPositions, sense: Ints, there: Alternative, legs: Sequence[RoutePath]
+) -> _Relative:
+    """The error of positions against one alternative: on its track, else along their own path to the train."""
     rows = there.rows
     at_m, along = there.route.coordinate(positions.element[rows], positions.measure_m[rows], there.middle_m)
     forward = sense[rows] * along > 0
@@ -218,14 +230,14 @@ def _relative(positions: MatchedPositions, sense: Ints, there: Alternative, legs
     high_m = np.where(forward, at_m - there.low_m, there.high_m - at_m)
     off_track = ~np.isfinite(at_m)
     if off_track.any():
-        low_m[off_track], high_m[off_track], off_track[off_track] = _by_own_path(
+        low_m[off_track], high_m[off_track], off_track[off_track] = _compare_along_own_path(
             positions, there.where(off_track), legs
         )
     return low_m, high_m, off_track
 
 
-def _by_own_path(positions: MatchedPositions, there: Alternative, legs: Sequence[RoutePath]) -> _Relative:
-    """The error along the solution's own path, for positions off the train's track, where that path leads to the train.
+def _compare_along_own_path(positions: MatchedPositions, there: Alternative, legs: Sequence[RoutePath]) -> _Relative:
+    """The error along the solution's own path, of positions off the train's track, where that leads to the train.
 
     Counted that far along the train's track, the position's place may lie on that track: then the two tracks are
     parallel, and the position is on another track, at no distance along. (Without this 5 of 5 runs that end 1 to 8 m
@@ -251,12 +263,12 @@ def _by_own_path(positions: MatchedPositions, there: Alternative, legs: Sequence
     return np.where(off_track, np.nan, low_m), np.where(off_track, np.nan, high_m), off_track
 
 
-def with_own_anchors(
+def judge_by_own_anchors(
     judged: Judgements, positions: MatchedPositions, train_m: Interval, config: HazardConfig
 ) -> Judgements:
-    """Where there is no other evidence, by the odometer since an accepted VB: wrong, or unknown, never right.
+    """The judgements, where there is no other evidence by the odometer since an accepted VB.
 
-    `train_m`: least and largest path position of the train.
+    Wrong or unknown, never right. `train_m`: least and largest path position of the train.
     """
     rows = (judged.kind == NOTHING) & positions.known & np.isfinite(train_m[0])
     low_m = positions.path_m - train_m[1]

@@ -1,4 +1,4 @@
-"""The epochs of one solution as columns that the state machine walks along."""
+"""What the LDS walks along: epochs as columns, crossings and telegrams of balises, expectation windows."""
 
 from __future__ import annotations
 
@@ -34,25 +34,26 @@ class Journey:
     def __init__(self, epochs: AlignedEpochs, scale_sigma: float | None, config: Configuration) -> None:
         """The only place where the LDS reads columns of aligned epochs."""
         self.t_ns = epochs.t_ns
-        self.leg: Ints = _held(epochs.leg, epochs.leg >= 0, 0)
+        self.leg: Ints = _last_known(epochs.leg, epochs.leg >= 0, 0)
         self.path_m = epochs.path_m
         self.positioned: Bools = epochs.positioned
         self.placed_nowhere: Bools = epochs.fix_valid & ~self.positioned
         self.refusal = _refusals(epochs, config)
-        self.sigma_m: Floats = _held(epochs.position_sigma_m, np.isfinite(epochs.position_sigma_m), np.nan)
+        self.sigma_m: Floats = _last_known(epochs.position_sigma_m, np.isfinite(epochs.position_sigma_m), np.nan)
         self.confidence_m = epochs.confidence_m
         self.odometer_m = epochs.odometer_m
         self.doubt_m = epochs.odometer_doubt_m
         self.slips = epochs.odometer_slips
         self.rows_m = np.nan_to_num(epochs.odometer_rows_m)
         self.scale_sigma = scale_sigma
-        self.direction = _direction(self.odometer_m, epochs.direction, config.lds.odometer_fixed_m)
+        self.direction = _travel_direction(self.odometer_m, epochs.direction, config.lds.odometer_fixed_m)
         self.travelled_m = epochs.travelled_m
         self.gap_ns = crossing_gaps_ns(self.t_ns, config.lds)
-        self.blind = _blind(self.t_ns, self.positioned, self.gap_ns)
+        self.blind = _are_blind(self.t_ns, self.positioned, self.gap_ns)
 
     @cached_property
     def usable(self) -> Bools:
+        """Epochs at which a detection would count."""
         return np.array([refusal is None for refusal in self.refusal], dtype=bool)
 
     @cached_property
@@ -63,15 +64,17 @@ class Journey:
 
     @cached_property
     def ambiguous(self) -> Bools:
+        """Epochs whose track is ambiguous."""
         return np.array([refusal is PassageStatus.REJECTED_AMBIGUOUS for refusal in self.refusal], dtype=bool)
 
     @cached_property
-    def on_odometer(self) -> Ints:
+    def with_odometer(self) -> Ints:
+        """Numbers of the epochs with a known odometer distance."""
         return np.flatnonzero(np.isfinite(self.odometer_m))
 
     @property
     def has_odometer(self) -> bool:
-        return self.on_odometer.size > 0
+        return self.with_odometer.size > 0
 
     def absence(self, epochs: slice) -> PassageStatus:
         """The status of a balise passed without a position on the path: fixes off all track, or no fix."""
@@ -79,7 +82,7 @@ class Journey:
         return PassageStatus.REJECTED_AMBIGUOUS if unplaced else PassageStatus.NOT_AVAILABLE
 
 
-def _blind(t_ns: Ints, positioned: Bools, gap_ns: Ints) -> Bools:
+def _are_blind(t_ns: Ints, positioned: Bools, gap_ns: Ints) -> Bools:
     """Epochs longer than a crossing is interpolated over after the last position, and all before the first one."""
     last_ns = np.maximum.accumulate(np.where(positioned, t_ns, np.iinfo(np.int64).min))
     first = np.argmax(positioned) if positioned.any() else t_ns.size
@@ -88,14 +91,14 @@ def _blind(t_ns: Ints, positioned: Bools, gap_ns: Ints) -> Bools:
     return blind
 
 
-def _held(values: AnyArray, known: Bools, first: float) -> AnyArray:
-    """Each value that is not known as the last one that is; before any of them `first`."""
+def _last_known(values: AnyArray, known: Bools, first: float) -> AnyArray:
+    """The values, those not known replaced by the last one that is; before any of them by `first`."""
     last = np.maximum.accumulate(np.where(known, np.arange(values.size), -1))
     return np.where(last >= 0, values[last], first).astype(values.dtype)
 
 
 def _refusals(epochs: AlignedEpochs, config: Configuration) -> list[PassageStatus | None]:
-    """Ambiguity before confidence; what is not known is never taken as good."""
+    """Per epoch why a detection there would not count, None where it would; ambiguity before confidence."""
     refusals = np.full(epochs.height, None)
     refusals[~(epochs.confidence_m <= config.lds.ci_limit_m)] = PassageStatus.REJECTED_CONFIDENCE
     refusals[~epochs.unambiguous] = PassageStatus.REJECTED_AMBIGUOUS
@@ -103,13 +106,13 @@ def _refusals(epochs: AlignedEpochs, config: Configuration) -> list[PassageStatu
     return list(refusals)
 
 
-def _direction(odometer_m: Floats, matched: Ints, turn_m: float) -> Ints:
+def _travel_direction(odometer_m: Floats, matched: Ints, turn_m: float) -> Ints:
     """Direction of travel along growing path, as known at each epoch.
 
     With an odometer the train has turned once it came back by `turn_m`: a wheel's jitter at a stand is no turn.
     """
     if not np.isfinite(odometer_m).any():
-        return _held(matched, matched != 0, 1)
+        return _last_known(matched, matched != 0, 1)
     known = np.flatnonzero(np.isfinite(odometer_m))
     direction = np.ones(odometer_m.size, dtype=np.int64)
     for _, seen_at, sense in turns_of(odometer_m[known], turn_m):
@@ -119,12 +122,12 @@ def _direction(odometer_m: Floats, matched: Ints, turn_m: float) -> Ints:
 
 def turning_epochs(journey: Journey) -> frozenset[int]:
     """Epochs at which direction or leg change, odometer known."""
-    known = journey.on_odometer
+    known = journey.with_odometer
     changed = (np.diff(journey.direction[known]) != 0) | (np.diff(journey.leg[known]) != 0)
     return frozenset(known[1:][changed].tolist())
 
 
-def odometer_epochs(journey: Journey) -> list[int]:
+def odometer_doubt_epochs(journey: Journey) -> list[int]:
     """Epochs at which the odometer begins to slip, or its distance came into doubt."""
     changes = (np.diff(journey.doubt_m) != 0.0) | (journey.slips[1:] & ~journey.slips[:-1])
     epochs: list[int] = (np.flatnonzero(changes) + 1).tolist()
@@ -164,11 +167,13 @@ class Window(NamedTuple):
         return self.open_m <= distance_m <= self.close_m
 
 
-def window_m(distance_m: float, accuracy_m: float, reference_accuracy_m: float, config: LdsConfig = DEFAULTS) -> Window:
+def expectation_window(
+    distance_m: float, accuracy_m: float, reference_accuracy_m: float, config: LdsConfig = DEFAULTS
+) -> Window:
     """Window of a balise announced `distance_m` beyond the reference (SUBSET-026 3.4.4.4.3, 3.6.4.1).
 
-    The odometer's reading d is true to 5 m + 5 % of d (SUBSET-041 5.3.1.1), so the window is
-    d + (5 + 0.05 d) >= D - Q - Q_r and d - (5 + 0.05 d) <= D + Q + Q_r: not symmetric about D.
+    The odometer's reading d is true to 5 m + 5 % of d (SUBSET-041 5.3.1.1), so the window is d + (5 + 0.05 d) >= D - Q
+    - Q_r and d - (5 + 0.05 d) <= D + Q + Q_r: not symmetric about D.
     """
     margin_m = accuracy_m + reference_accuracy_m + config.odometer_fixed_m
     return Window(
@@ -177,8 +182,8 @@ def window_m(distance_m: float, accuracy_m: float, reference_accuracy_m: float, 
     )
 
 
-def window_after_turn_m(distance_m: float, travelled_m: float, margin_m: float, config: LdsConfig = DEFAULTS) -> Window:
-    """Where the train turned round since the reference: 5 % of the whole distance run, not of the net distance.
+def window_after_turn(distance_m: float, travelled_m: float, margin_m: float, config: LdsConfig = DEFAULTS) -> Window:
+    """Window where the train turned round since the reference; 5 % count on the whole distance run, not the net one.
 
     `margin_m` is Q + Q_r + 5 m. The clauses know no such case.
     """
@@ -191,7 +196,7 @@ def minimal_spacing_m(
 ) -> float:
     """Smallest distance to the next balise whose window does not overlap its own (LOC section III)."""
     margin_m = next_accuracy_m + reference_accuracy_m + config.odometer_fixed_m
-    close_m = window_m(distance_m, accuracy_m, reference_accuracy_m, config).close_m
+    close_m = expectation_window(distance_m, accuracy_m, reference_accuracy_m, config).close_m
     return close_m * (1.0 + config.odometer_share) + margin_m - distance_m
 
 
@@ -214,8 +219,8 @@ class Balise:
     reaction: Reaction
     valid_direction: int
 
-    def is_valid(self, direction: int) -> bool:
-        """To a train in another direction it does not exist (DOMAIN section 4)."""
+    def is_valid_for(self, direction: int) -> bool:
+        """Whether it exists for a train in this direction of travel (DOMAIN section 4)."""
         return self.valid_direction in (0, direction)
 
 
@@ -266,7 +271,7 @@ class Passage:
     announced_odometer_m: float | None = None
 
     def record(self, error: LinkingError, reaction: Reaction) -> None:
-        """The first linking error of a passage stays, the most severe reaction counts."""
+        """Note a linking error: the first one of a passage stays, the most severe reaction counts."""
         if self.linking_error is LinkingError.NONE:
             self.linking_error = error
         self.reaction = max(self.reaction, reaction, key=_SEVERITY.index)
@@ -287,6 +292,7 @@ class Disarmed:
         return bool(self._at)
 
     def holds(self, balise: Balise) -> bool:
+        """Whether the balise cannot be detected again yet."""
         return balise.balise_id in self._at
 
     def add(self, crossing: Crossing) -> None:
@@ -294,14 +300,15 @@ class Disarmed:
         self._at[crossing.balise.balise_id] = (crossing.balise, odometer_m)
 
     def rearm(self, begin: int, end: int) -> None:
-        """Those that are far enough away at one of the epochs from `begin` on, before `end`."""
+        """Re-arm balises that are far enough away at one of the epochs from `begin` on, before `end`."""
         part = slice(begin, end)
         away_m = np.fmax(self._config.rearm_m, self._config.rearm_sigmas * self._journey.sigma_m[part])
         for name, (balise, at_m) in list(self._at.items()):
-            if (np.abs(self._moved_m(part, balise, at_m)) >= away_m).any():
+            if (np.abs(self._distance_since_m(part, balise, at_m)) >= away_m).any():
                 del self._at[name]
 
-    def _moved_m(self, part: slice, balise: Balise, at_m: float) -> Floats:
+    def _distance_since_m(self, part: slice, balise: Balise, at_m: float) -> Floats:
+        """Distance of some epochs from the crossing of a balise [m]."""
         if not self._journey.has_odometer:
             return self._journey.path_m[part] - balise.path_m
         odometer_m = self._journey.odometer_m[part]
@@ -312,7 +319,8 @@ class Disarmed:
         return odometer_m - at_m
 
 
-def balises_of(frame: pl.DataFrame, kind: BaliseKind) -> list[Balise]:
+def balises_of_kind(frame: pl.DataFrame, kind: BaliseKind) -> list[Balise]:
+    """The balises of one kind, in order of leg and path position."""
     of_kind = frame.filter(pl.col("kind").cast(pl.String) == kind.value).sort("leg", "path_m", "balise_id")
     rows = of_kind.select(
         *("leg", "linked", "valid_direction", *PLACE), accuracy_m="location_accuracy_m", reaction="link_reaction"
@@ -321,7 +329,7 @@ def balises_of(frame: pl.DataFrame, kind: BaliseKind) -> list[Balise]:
 
 
 def find_crossings(journey: Journey, balises: Sequence[Balise]) -> list[Crossing]:
-    """Crossings of virtual balises, those of one step in the order of being passed (`passings`)."""
+    """Crossings of virtual balises by the position, leg by leg; those of one step in the order of being passed."""
     known = np.flatnonzero(journey.positioned)
     crossings: list[Crossing] = []
     for leg in sorted({balise.leg for balise in balises}):
@@ -329,15 +337,15 @@ def find_crossings(journey: Journey, balises: Sequence[Balise]) -> list[Crossing
         # Every stretch of steps on this leg; of a step the leg is that of its later end.
         for first, last in spans_of(journey.leg[known[1:]] == leg):
             rows = known[first : last + 2]
-            passed = passings(journey.path_m[rows], [balise.path_m for balise in on_leg])
-            crossings += [
-                _crossing(journey, on_leg[one.place], one, *rows[one.after - 1 : one.after + 1]) for one in passed
-            ]
+            for passing in passings(journey.path_m[rows], [balise.path_m for balise in on_leg]):
+                before, after = rows[passing.after - 1 : passing.after + 1]
+                crossings.append(_interpolated_crossing(journey, on_leg[passing.place], passing, before, after))
     # Valid in the direction as known then: in the first metres after a turn that is still the old one.
-    return [crossing for crossing in crossings if crossing.balise.is_valid(crossing.direction)]
+    return [crossing for crossing in crossings if crossing.balise.is_valid_for(crossing.direction)]
 
 
-def _crossing(journey: Journey, balise: Balise, passing: Passing, before: int, epoch: int) -> Crossing:
+def _interpolated_crossing(journey: Journey, balise: Balise, passing: Passing, before: int, epoch: int) -> Crossing:
+    """The crossing of a balise between two epochs, interpolated unless a gap lies between them."""
     near = bool(journey.t_ns[epoch] - journey.t_ns[before] <= journey.gap_ns[epoch])
     passing = passing if near else passing._replace(share=1.0)
     odometer_m = journey.odometer_m
@@ -350,24 +358,25 @@ def _crossing(journey: Journey, balise: Balise, passing: Passing, before: int, e
         t_ns=passing.instant_ns(int(journey.t_ns[before]), int(journey.t_ns[epoch])),
         sense=passing.sense,
         direction=direction,
-        odometer_m=_known(float(odometer_m[epoch]) - back_m),
+        odometer_m=_none_for_nan(float(odometer_m[epoch]) - back_m),
         travelled_m=float(journey.travelled_m[epoch]) - back_m * direction,
-        confidence_m=_known(float(journey.confidence_m[epoch])),
+        confidence_m=_none_for_nan(float(journey.confidence_m[epoch])),
         absence=None if near else journey.absence(slice(before + 1, epoch)),
     )
 
 
-def _known(value: float) -> float | None:
+def _none_for_nan(value: float) -> float | None:
+    """The value, None for NaN."""
     return None if isnan(value) else value
 
 
 def in_order_of_time(crossings: Sequence[Crossing]) -> list[Crossing]:
-    """The place in this list is the `crossing_id`."""
+    """Crossings in order of time; the place in this list is the `crossing_id`."""
     return sorted(crossings, key=lambda crossing: (crossing.t_ns, crossing.epoch, crossing.balise.kind.value))
 
 
 def arrays_of_crossings(crossings: Sequence[Crossing]) -> Crossings:
-    """What the LDS passed, for later stages."""
+    """The crossings as arrays, for later stages."""
     balises = [crossing.balise for crossing in crossings]
     return Crossings(
         balise_id=[balise.balise_id for balise in balises],
@@ -390,10 +399,10 @@ def arrays_of_crossings(crossings: Sequence[Crossing]) -> Crossings:
 _STATUS: dict[PassageStatus | None, int] = {status: number for number, status in enumerate(PassageStatus)}
 
 
-def reads_of(
+def telegrams_on_path(
     frame: pl.DataFrame | None, balises: list[Balise], journey: Journey
 ) -> tuple[list[Crossing], pl.DataFrame]:
-    """Telegrams (`t, balise_id`, `odometer_m`) in order of time, and those of balises not on the path."""
+    """Telegrams (`t, balise_id`, `odometer_m`) as crossings in order of time, and those of balises not on the path."""
     if frame is None:
         return [], pl.DataFrame(schema={"t": pl.Datetime("ns", "UTC"), "balise_id": pl.String})
     places: dict[str, list[Balise]] = {}
@@ -405,15 +414,15 @@ def reads_of(
     reads: list[Crossing] = []
     last: Crossing | None = None
     for t_ns, balise_id, odometer_m in zip(rows["t_ns"], rows["balise_id"], odometer, strict=True):
-        reads.append(_read(t_ns, places[balise_id], odometer_m, journey, last))
+        reads.append(_telegram_crossing(t_ns, places[balise_id], odometer_m, journey, last))
         last = last if odometer_m is None else reads[-1]
     return reads, frame.filter(~known).select("t", "balise_id")
 
 
-def _read(
+def _telegram_crossing(
     t_ns: int, places: list[Balise], odometer_m: float | None, journey: Journey, last: Crossing | None
 ) -> Crossing:
-    """One telegram at the visit of the path that it belongs to; `last`: the one before with a known odometer."""
+    """A telegram as a crossing at the visit of the path it belongs to; `last`: the one before with an odometer."""
     epoch = min(int(np.searchsorted(journey.t_ns, t_ns)), journey.t_ns.size - 1)
     before = max(int(np.searchsorted(journey.t_ns, t_ns, side="right")) - 1, 0)
     here_m = float(np.nan_to_num(journey.path_m[epoch]))

@@ -1,7 +1,7 @@
-"""The re-link: is GNSS minus odometer what it was at the anchor? (DOMAIN section 4)
+"""Monitors of linking: the re-link after time out of use, the order of balises, and the linking distance.
 
-What the odometer may have miscounted widens the bound, up to half the failure limit; if that is more, only a telegram
-re-links.
+A re-link asks whether GNSS minus odometer is what it was at the anchor (DOMAIN section 4). What the odometer may have
+miscounted widens its bound, up to half the failure limit; if that is more, only a telegram re-links.
 """
 
 from __future__ import annotations
@@ -46,6 +46,7 @@ class Anchor:
 
     @classmethod
     def at_epoch(cls, journey: Journey, epoch: int) -> Anchor:
+        """The anchor at the position of an epoch."""
         offset_m = float(journey.path_m[epoch] - journey.odometer_m[epoch])
         return cls(
             epoch, int(journey.t_ns[epoch]), offset_m, float(journey.sigma_m[epoch]), float(journey.travelled_m[epoch])
@@ -53,7 +54,7 @@ class Anchor:
 
     @classmethod
     def at_crossing(cls, journey: Journey, crossing: Crossing, sigma_m: float) -> Anchor | None:
-        """By the balise's own place; None where the odometer is not known there."""
+        """The anchor at the place of a balise; None where the odometer is not known there."""
         whole = journey.doubt_m[crossing.epoch] == journey.doubt_m[crossing.before]
         if crossing.odometer_m is None or not whole or not isfinite(crossing.travelled_m):
             return None
@@ -72,6 +73,7 @@ class Comparison:
 
     @property
     def holds(self) -> bool:
+        """Whether the position moved no farther than the bound."""
         return self.reason is None and abs(self.moved_m) <= self.bound_m
 
 
@@ -103,6 +105,7 @@ class Relink:
         self.begin_mission(0)
 
     def begin_mission(self, epoch: int) -> None:
+        """Forget telegram and anchor: TVBs count from this epoch on."""
         self._mission_from = epoch
         self._read: Anchor | None = None
         self._anchor: Anchor | None = None
@@ -110,6 +113,7 @@ class Relink:
         self._hold_to_ns: int | None = None
 
     def note_read(self, read: Crossing) -> None:
+        """A telegram becomes the anchor, where the odometer is known at it."""
         anchor = Anchor.at_crossing(self._journey, read, self._config.hazards.balise_read_sigma_m)
         if anchor is not None:
             self._read = self._anchor = anchor
@@ -129,17 +133,18 @@ class Relink:
         self._hold_to_ns = int(self._journey.t_ns[epoch]) + self._memory_ns
 
     def is_held(self, epoch: int) -> bool:
+        """Whether the position is still held to the anchor at this epoch."""
         return self._hold_to_ns is not None and int(self._journey.t_ns[epoch]) <= self._hold_to_ns
 
-    def held_m(self, epoch: int) -> tuple[Floats, Floats]:
-        """What the position moved since the anchor and may have [m], at each epoch of the hold from this one on."""
+    def movement_in_hold_m(self, epoch: int) -> tuple[Floats, Floats]:
+        """How far the position moved since the anchor, and may have [m], at each epoch of the hold from this one on."""
         assert self._hold_to_ns is not None
         assert self._anchor is not None
         end = int(np.searchsorted(self._journey.t_ns, self._hold_to_ns, side="right"))
-        return self._moved_m(self._anchor, epoch, max(end, epoch))
+        return self._movement_since_m(self._anchor, epoch, max(end, epoch))
 
     def compare(self, epoch: int) -> Comparison:
-        """Is GNSS minus odometer at this epoch what it was at the anchor?"""
+        """Compare GNSS minus odometer at this epoch with what it was at the anchor, and note a re-link that holds."""
         anchor = self._anchor
         if not self._config.lds.relink:
             return Comparison(reason=NotEvaluated.RELINK_OFF)
@@ -153,13 +158,13 @@ class Relink:
         if doubt_m > self._rule.most_m:
             # Slip at each start counts too much each time, and would soon explain any fault.
             return Comparison(reason=NotEvaluated.RELINK_SLIPPED)
-        moved_m, bound_m = (float(values[0]) for values in self._moved_m(anchor, epoch, epoch + 1))
+        moved_m, bound_m = (float(values[0]) for values in self._movement_since_m(anchor, epoch, epoch + 1))
         comparison = Comparison(moved_m, bound_m)
         if comparison.holds:
             self.held.append(Held(epoch, None if anchor.is_read else anchor.epoch, moved_m, bound_m + doubt_m))
         return comparison
 
-    def _moved_m(self, anchor: Anchor, epoch: int, end: int) -> tuple[Floats, Floats]:
+    def _movement_since_m(self, anchor: Anchor, epoch: int, end: int) -> tuple[Floats, Floats]:
         """How far GNSS minus odometer moved since the anchor at these epochs, and how far it may have [m].
 
         NaN where the odometer lost its distance, or may have miscounted too much through slip.
@@ -178,13 +183,15 @@ class Relink:
         return np.where(known, moved_m, np.nan), np.minimum(self._rule.most_m, bound_m + doubt_m)
 
     def _first_tvb(self, epoch: int) -> Anchor | None:
-        return self._at_tvb(range(self._mission_from, epoch))
+        """The anchor at the first TVB of the mission before an epoch."""
+        return self._anchor_at_first(range(self._mission_from, epoch))
 
     def _last_tvb(self, epoch: int) -> Anchor | None:
-        return self._at_tvb(range(epoch - 1, self._mission_from - 1, -1))
+        """The anchor at the last TVB of the mission before an epoch."""
+        return self._anchor_at_first(range(epoch - 1, self._mission_from - 1, -1))
 
-    def _at_tvb(self, epochs: Iterable[int]) -> Anchor | None:
-        """At the first of these epochs that is a TVB, where the odometer is known."""
+    def _anchor_at_first(self, epochs: Iterable[int]) -> Anchor | None:
+        """The anchor at the first of these epochs that is a TVB, where the odometer is known."""
         found = next((k for k in epochs if self._tvb[k] and self._journey.comparable[k]), None)
         return None if found is None else Anchor.at_epoch(self._journey, found)
 
@@ -199,13 +206,11 @@ class Recovery:
         self._failed_at_ns = self._observed_at_ns = 0
 
     def begin(self, epoch: int) -> None:
+        """The position is negated from this epoch on."""
         self._failed_at_ns = self._observed_at_ns = int(self._journey.t_ns[epoch])
 
     def is_over(self, epoch: int, evaluated: bool, failing: bool) -> bool:
-        """`recovery_s` without a failure of the raw and fastest monitors, observed without a gap, and usable now.
-
-        Observed is an epoch with a verdict of `along_raw` (`evaluated`); without an odometer, with a usable position.
-        """
+        """Whether raw and fastest monitors were silent for `recovery_s`, observed without a gap; usable now."""
         t_ns = int(self._journey.t_ns[epoch])
         usable = bool(self._journey.usable[epoch])
         observed = evaluated if self._journey.has_odometer else usable
@@ -225,12 +230,8 @@ ORDER_THRESHOLD = 0.5
 _FIRST_BLOCK, _BLOCK = 64, 4096
 
 
-def disorder(offered: list[Crossing], overdue: int, journey: Journey, config: Configuration) -> int:
-    """Number of balises of one step that were offered out of order (what finds 1A, DIAG Hazards).
-
-    Two at once, or one against the direction of travel, where the odometer's step does not explain the position's;
-    `overdue` ones, whose window has closed, always.
-    """
+def count_out_of_order(offered: list[Crossing], overdue: int, journey: Journey, config: Configuration) -> int:
+    """Number of balises of one step that were offered out of order (what finds 1A, DIAG Hazards)."""
     before = offered[0].before
     after = offered[0].epoch
     odometer_step_m = journey.odometer_m[after] - journey.odometer_m[before]
@@ -243,7 +244,7 @@ def disorder(offered: list[Crossing], overdue: int, journey: Journey, config: Co
 
 
 class LinkOrder:
-    """Order of identities, step by step."""
+    """The monitor `link_order`: the order of identities, step by step."""
 
     def __init__(self, journey: Journey, config: Configuration) -> None:
         self._reason = _order_reasons(journey, "link_order" in config.monitors.disabled, config)
@@ -251,12 +252,15 @@ class LinkOrder:
         self._value = np.zeros(journey.t_ns.size)
 
     def is_evaluated(self, epoch: int) -> bool:
+        """Whether the monitor has a verdict at this epoch."""
         return bool(self._evaluated[epoch])
 
     def note(self, epoch: int, out_of_order: int) -> None:
+        """Note how many balises were offered out of order in the step to this epoch."""
         self._value[epoch] = out_of_order
 
     def verdicts(self) -> Verdicts:
+        """Verdicts of all epochs."""
         return verdicts(self._value, np.full(self._value.size, ORDER_THRESHOLD), self._reason)
 
 
@@ -284,59 +288,64 @@ class LinkDistance:
         self._since_return = np.full((2, journey.t_ns.size), np.nan)  # moved since the re-link anchor, its bound
 
     def measure_from(self, anchor: Anchor | None, epoch: int) -> None:
-        self._end_at(epoch)
+        """After this epoch the distance is measured from another anchor; None: from nowhere."""
+        self._evaluate_before_change(epoch)
         self._anchor = anchor
 
-    def hold_to(self, epoch: int, moved_m: Floats, bound_m: Floats) -> None:
-        """From `epoch` on the distance since the re-link anchor counts, for as long as it is given."""
-        self._end_at(epoch)
+    def hold_to_relink_anchor(self, epoch: int, moved_m: Floats, bound_m: Floats) -> None:
+        """From `epoch` on the distance since the re-link anchor counts, for as long as it is given [m]."""
+        self._evaluate_before_change(epoch)
         self._since_return[:, epoch:] = np.nan
         self._since_return[:, epoch : epoch + moved_m.size] = moved_m, bound_m
 
     @property
-    def measures(self) -> bool:
-        """There is something to measure from."""
+    def has_anchor(self) -> bool:
+        """Whether there is something to measure from."""
         return self._anchor is not None
 
     def can_measure(self, epoch: int) -> bool:
-        """Nothing of the odometer's distance since the anchor is in doubt."""
+        """Whether nothing of the odometer's distance since the anchor is in doubt."""
         doubt_m = self._journey.doubt_m
         return self._anchor is not None and bool(doubt_m[self._anchor.epoch] == doubt_m[epoch])
 
     def fails(self, epoch: int) -> bool:
+        """Whether the monitor fails at this epoch."""
         if self._anchor is None:
             return False
-        self._look(self._anchor, epoch)
+        self._evaluate_up_to(self._anchor, epoch)
         return bool(self._fails[epoch])
 
     def quiet_until(self, epoch: int, end: int) -> int:
         """The first epoch from `epoch` on that fails or is not evaluated yet; at most `end`."""
         if self._anchor is None:
             return end
-        self._look(self._anchor, epoch)
+        self._evaluate_up_to(self._anchor, epoch)
         ahead = self._fails[epoch : min(self._done, end)]
         first = int(ahead.argmax())
         return epoch + (first if ahead[first] else ahead.size)
 
-    def _look(self, anchor: Anchor, epoch: int) -> None:
-        """A block ahead at once, and whatever nobody asked for before it: a failing bank is alarm enough."""
+    def _evaluate_up_to(self, anchor: Anchor, epoch: int) -> None:
+        """Evaluate up to this epoch and a block ahead, and whatever nobody asked for before."""
         if epoch >= self._done:
             begin = self._done if self._begun else epoch
             self._done = min(epoch + self._block, self._fails.size)
             self._block = min(2 * self._block, _BLOCK)
             self._begun = True
-            self._evaluate(anchor, slice(begin, self._done))
+            self._evaluate_block(anchor, slice(begin, self._done))
 
-    def _end_at(self, epoch: int) -> None:
+    def _evaluate_before_change(self, epoch: int) -> None:
         """What it is measured from changes: epochs up to this one are evaluated, those after it anew."""
         if self._anchor is not None and self._begun and epoch >= self._done:
-            self._evaluate(self._anchor, slice(self._done, epoch + 1))
+            self._evaluate_block(self._anchor, slice(self._done, epoch + 1))
         self._done = epoch
         self._begun = False
         self._block = _FIRST_BLOCK
 
-    def _evaluate(self, anchor: Anchor, ahead: slice) -> None:
-        """Elementwise, so every epoch still knows only its own past."""
+    def _evaluate_block(self, anchor: Anchor, ahead: slice) -> None:
+        """Write value, threshold and reason of some epochs.
+
+        Elementwise, so every epoch still knows only its own past.
+        """
         driven_m = np.abs(self._journey.travelled_m[ahead] - anchor.travelled_m)
         rows_m2 = self._journey.rows_m[ahead] ** 2 + self._journey.rows_m[anchor.epoch] ** 2
         noise_m = self._factor * np.sqrt(self._journey.sigma_m[ahead] ** 2 + anchor.sigma_m**2 + rows_m2)
@@ -352,7 +361,7 @@ class LinkDistance:
         self._threshold[ahead] = np.where(known, np.where(held, bound_m, threshold_m), np.nan)
         self._fails[ahead] = np.abs(self._value[ahead]) > self._threshold[ahead]
 
-    def hold_against(self, comparison: Comparison, epoch: int) -> None:
+    def note_comparison(self, comparison: Comparison, epoch: int) -> None:
         """The verdict of a re-link joins that of the bounds at `epoch`, whose fail remains."""
         if not self._possible[epoch] or self.fails(epoch):
             return
@@ -362,19 +371,21 @@ class LinkDistance:
         self._reason[epoch] = NO_REASON if comparison.reason is None else NUMBER[comparison.reason]
 
     def forget(self, epoch: int) -> None:
+        """A new mission begins: nothing to measure from, no verdict from this epoch on."""
         self.measure_from(None, epoch)
         self._since_return[:, epoch:] = np.nan
         self._value[epoch:] = self._threshold[epoch:] = np.nan
         self._reason[epoch:][self._possible[epoch:]] = NO_REASON
 
     def verdicts(self) -> Verdicts:
-        self._end_at(self._fails.size - 1)
+        """Verdicts of all epochs."""
+        self._evaluate_before_change(self._fails.size - 1)
         never = first_reason((np.isnan(self._value), NotEvaluated.NEVER_VALIDATED))
         return verdicts(self._value, self._threshold, otherwise(self._reason, never))
 
 
 def _order_reasons(journey: Journey, disabled: bool, config: Configuration) -> Ints:
-    """Per step: both its ends must be good for it."""
+    """Why `link_order` has no verdict of the step to each epoch; both its ends must be good for it."""
     known = np.flatnonzero(journey.positioned)
     before = np.full(journey.t_ns.size, -1)
     before[known[1:]] = known[:-1]
@@ -388,22 +399,23 @@ def _order_reasons(journey: Journey, disabled: bool, config: Configuration) -> I
         (~odometer[before], NO_ODOMETER),
         (journey.ambiguous | journey.ambiguous[before], NotEvaluated.AMBIGUOUS_OR_OFF),
         (~(sigma & sigma[before]), NO_SIGMA),
-        (_is_coarse(journey, config), NotEvaluated.NOISE_TOO_LARGE),
+        (_are_coarse(journey, config), NotEvaluated.NOISE_TOO_LARGE),
     )
 
 
 def _distance_reasons(journey: Journey, disabled: bool, config: Configuration) -> Ints:
+    """Why `link_distance` has no verdict at each epoch."""
     return first_reason(
         (np.full(journey.t_ns.size, disabled), DISABLED),
         (~np.isfinite(journey.odometer_m), NO_ODOMETER),
         (~journey.positioned, NO_POSITION),
         (journey.ambiguous, NotEvaluated.AMBIGUOUS_OR_OFF),
         (~np.isfinite(journey.sigma_m), NO_SIGMA),
-        (_is_coarse(journey, config), NotEvaluated.NOISE_TOO_LARGE),
+        (_are_coarse(journey, config), NotEvaluated.NOISE_TOO_LARGE),
     )
 
 
-def _is_coarse(journey: Journey, config: Configuration) -> Bools:
-    """Rows of the odometer scatter by as much as thresholds allow for, or more: no threshold would hold."""
+def _are_coarse(journey: Journey, config: Configuration) -> Bools:
+    """Epochs at which rows of the odometer scatter by as much as thresholds allow for: no threshold would hold."""
     coarse: Bools = journey.rows_m >= config.scatter_limit_m
     return coarse

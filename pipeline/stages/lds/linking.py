@@ -10,7 +10,15 @@ from bisect import bisect_left, bisect_right
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from pipeline.stages.lds.crossings import Balise, Crossing, Journey, Passage, Window, window_after_turn_m, window_m
+from pipeline.stages.lds.crossings import (
+    Balise,
+    Crossing,
+    Journey,
+    Passage,
+    Window,
+    expectation_window,
+    window_after_turn,
+)
 from schemas.config import LdsConfig
 from schemas.enums import LinkingError, PassageStatus, Reaction
 
@@ -29,7 +37,7 @@ class LinkingReference:
 
 @dataclass(frozen=True, slots=True)
 class LrvbChange:
-    """From `epoch` on."""
+    """The LRVB from `epoch` on, and whether the chain of TVBs has begun."""
 
     epoch: int
     lrvb: LinkingReference | None
@@ -38,6 +46,8 @@ class LrvbChange:
 
 @dataclass(frozen=True, slots=True)
 class _Turn:
+    """Odometer distance from the reference at which the train turned, and the distance run up to there [m]."""
+
     distance_m: float
     travelled_m: float
 
@@ -54,11 +64,13 @@ class _Announced:
             self._places.setdefault(balise.balise_id, []).append(place)
 
     def place_of(self, balise_id: str, begin: int) -> int | None:
+        """Place of a balise among those announced, at `begin` or later; None where there is none."""
         places = self._places.get(balise_id, [])
         first = bisect_left(places, begin)
         return places[first] if first < len(places) else None
 
     def first_beyond(self, path_m: float) -> int:
+        """Place of the first balise beyond a path position [m], in the direction of travel."""
         return bisect_right(self._along_m, path_m * self._direction)
 
 
@@ -88,23 +100,24 @@ class LinkingChain:
 
     @property
     def linking(self) -> bool:
-        """Windows can be drawn from the reference."""
+        """Whether linking is in force: windows can be drawn from the reference."""
         return self.reference is not None and self.reference.odometer_m is not None
 
     def forget(self) -> None:
+        """Forget reference and expected balises: a new mission begins."""
         self.reference = None
         self._expect(_Announced([], 1), 0)
         self._own.clear()
         self._unoffered.clear()
 
     def is_overdue(self, balise: Balise) -> bool:
-        """Its window has closed without any offer."""
+        """Whether the window of a balise has closed without any offer."""
         return balise.balise_id in self._unoffered
 
     def advance(self, odometer_m: float, t_ns: int, absence: PassageStatus) -> None:
-        """The train has come to this reading; `absence`: status of balises not found in their window."""
+        """Close the windows that end before this odometer reading; `absence`: status of balises not found in them."""
         if self.linking:
-            self._close_windows(self._distance_m(odometer_m), t_ns, absence)
+            self._close_windows(self._distance_run_m(odometer_m), t_ns, absence)
 
     def turn(self, journey: Journey, epoch: int) -> None:
         """The train goes in the other direction, or on another leg: expect the balises ahead of it now.
@@ -117,10 +130,10 @@ class LinkingChain:
         self._direction = int(journey.direction[epoch])
         self._leg = int(journey.leg[epoch])
         travelled_m = float(journey.travelled_m[epoch]) - self.reference.travelled_m
-        self._turn = _Turn(self._distance_m(float(journey.odometer_m[epoch])), travelled_m)
+        self._turn = _Turn(self._distance_run_m(float(journey.odometer_m[epoch])), travelled_m)
         self._own.clear()
         self._unoffered.clear()
-        windows = [(balise, self._window(balise)) for balise in self._in_order_of_travel().balises]
+        windows = [(balise, self._window_of(balise)) for balise in self._announced_balises().balises]
         here_m = self._turn.distance_m
         self._optional = {balise.balise_id for balise, window in windows if window.holds(here_m)}
         ahead = [balise for balise, window in windows if window.close_m > here_m]
@@ -130,10 +143,10 @@ class LinkingChain:
         """Judge an offered balise; true where accepted. `refusal`: why it does not count as a detection."""
         distance_m = None
         if self.linking and crossing.odometer_m is not None:
-            distance_m = self._distance_m(crossing.odometer_m)
+            distance_m = self._distance_run_m(crossing.odometer_m)
             self._close_windows(distance_m, crossing.t_ns, PassageStatus.MISSED)
         overdue = crossing.sense == crossing.direction and self.is_overdue(crossing.balise)
-        passage = self._passage_of(crossing)
+        passage = self._offered_passage(crossing)
         passage.odometer_distance_m = distance_m
         if distance_m is None and not overdue:
             passage.window = None
@@ -144,12 +157,12 @@ class LinkingChain:
         elif distance_m is None:
             passage.status = PassageStatus.ACCEPTED
         else:
-            self._judge(passage, distance_m)
+            self._judge_detection(passage, distance_m)
         crossing.offered = True
         crossing.status = passage.status
         accepted = passage.status is PassageStatus.ACCEPTED
         if accepted:
-            self._refer_to(crossing)
+            self._begin_at(crossing)
         return accepted
 
     def pass_unoffered(self, crossing: Crossing, status: PassageStatus) -> None:
@@ -161,59 +174,62 @@ class LinkingChain:
         elif name in self._unoffered:
             self._unoffered[name].status = status
         else:
-            passage = self._new_passage(crossing.balise, crossing.t_ns, crossing.direction)
+            passage = self._add_passage(crossing.balise, crossing.t_ns, crossing.direction)
             passage.status = status
             self._own[name] = passage
 
     def finish(self, odometer_m: float, t_ns: int, absence: PassageStatus) -> None:
-        """The run ends without a position: balises passed by the odometer are `absence`."""
+        """End of a run without a position: add passages, of status `absence`, of balises passed by the odometer."""
         if not self.linking:
             return
-        distance_m = self._distance_m(odometer_m)
+        distance_m = self._distance_run_m(odometer_m)
         for balise in self._ahead.balises[self._next :]:
             not_offered = balise.balise_id not in self._own and balise.balise_id not in self._optional
-            if not_offered and self._announced_m(balise) < distance_m:
-                passage = self._new_passage(balise, t_ns, self._direction)
+            if not_offered and self._announced_distance_m(balise) < distance_m:
+                passage = self._add_passage(balise, t_ns, self._direction)
                 passage.status = absence
 
-    def _distance_m(self, odometer_m: float) -> float:
+    def _distance_run_m(self, odometer_m: float) -> float:
+        """Odometer distance from the reference, in the direction of travel [m]."""
         assert self.reference is not None
         assert self.reference.odometer_m is not None
         return (odometer_m - self.reference.odometer_m) * self._direction
 
-    def _announced_m(self, balise: Balise) -> float:
+    def _announced_distance_m(self, balise: Balise) -> float:
+        """Distance of a balise from the reference along the path, in the direction of travel [m]."""
         assert self.reference is not None
         return (balise.path_m - self.reference.balise.path_m) * self._direction
 
-    def _window(self, balise: Balise) -> Window:
+    def _window_of(self, balise: Balise) -> Window:
+        """The expectation window of a balise."""
         assert self.reference is not None
-        distance_m = self._announced_m(balise)
+        distance_m = self._announced_distance_m(balise)
         reference_accuracy_m = self.reference.balise.accuracy_m
         if self._turn is None:
-            return window_m(distance_m, balise.accuracy_m, reference_accuracy_m, self._config)
+            return expectation_window(distance_m, balise.accuracy_m, reference_accuracy_m, self._config)
         travelled_m = self._turn.travelled_m + abs(distance_m - self._turn.distance_m)
         margin_m = balise.accuracy_m + reference_accuracy_m + self._config.odometer_fixed_m
-        return window_after_turn_m(distance_m, travelled_m, margin_m, self._config)
+        return window_after_turn(distance_m, travelled_m, margin_m, self._config)
 
-    def _judge(self, passage: Passage, distance_m: float) -> None:
-        """A detection while linking is in force (SUBSET-026 3.16.2.3.1)."""
+    def _judge_detection(self, passage: Passage, distance_m: float) -> None:
+        """Set the status of a detection while linking is in force (SUBSET-026 3.16.2.3.1)."""
         balise = passage.balise
         if not balise.linked:
             passage.status = PassageStatus.REJECTED_UNLINKED
             return
         passage.status = PassageStatus.REJECTED_WINDOW
-        expected = self._expected_at(balise)
+        expected = self._expected_before(balise)
         if expected is None:
             return
-        if expected.balise_id == balise.balise_id and self._window(balise).holds(distance_m):
+        if expected.balise_id == balise.balise_id and self._window_of(balise).holds(distance_m):
             passage.status = PassageStatus.ACCEPTED
-        elif expected.balise_id != balise.balise_id and self._window(expected).holds(distance_m):
+        elif expected.balise_id != balise.balise_id and self._window_of(expected).holds(distance_m):
             passage.record(LinkingError.ORDER, expected.reaction)
         else:
             passage.record(LinkingError.EARLY, balise.reaction)
 
-    def _expected_at(self, balise: Balise) -> Balise | None:
-        """The first ahead that is not optional; None where the offered balise is not ahead."""
+    def _expected_before(self, balise: Balise) -> Balise | None:
+        """The first balise ahead that is not optional, up to the offered one; None where this is not ahead."""
         place = self._ahead.place_of(balise.balise_id, self._next)
         if place is None:
             return None
@@ -222,18 +238,19 @@ class LinkingChain:
         return next(required, self._ahead.balises[place])
 
     def _close_windows(self, distance_m: float, t_ns: int, absence: PassageStatus) -> None:
+        """Close the windows that end before this odometer distance, in order."""
         balises = self._ahead.balises
-        while self._next < len(balises) and distance_m > self._window(balises[self._next]).close_m:
-            self._close(balises[self._next], t_ns, absence)
+        while self._next < len(balises) and distance_m > self._window_of(balises[self._next]).close_m:
+            self._close_window(balises[self._next], t_ns, absence)
             self._expect(self._ahead, self._next + 1)
 
-    def _close(self, balise: Balise, t_ns: int, absence: PassageStatus) -> None:
-        """Not found in its window; the second in a row brakes (3.16.2.7; TVB eq. 4)."""
+    def _close_window(self, balise: Balise, t_ns: int, absence: PassageStatus) -> None:
+        """Note a balise that was not found in its window; the second in a row brakes (3.16.2.7; TVB eq. 4)."""
         if balise.balise_id in self._optional:
             return
         passage = self._own.pop(balise.balise_id, None)
         if passage is None:
-            passage = self._new_passage(balise, t_ns, self._direction)
+            passage = self._add_passage(balise, t_ns, self._direction)
             passage.status = absence
             self._unoffered[balise.balise_id] = passage
         self._missed_in_a_row += 1
@@ -241,7 +258,8 @@ class LinkingChain:
         if self._missed_in_a_row >= MISSED_IN_A_ROW:
             passage.record(LinkingError.MISSED, Reaction.SERVICE_BRAKE)
 
-    def _refer_to(self, crossing: Crossing) -> None:
+    def _begin_at(self, crossing: Crossing) -> None:
+        """The accepted balise becomes the reference, and the next ones are expected."""
         balise = crossing.balise
         self.reference = LinkingReference(balise, crossing.odometer_m, crossing.travelled_m)
         self._direction = crossing.direction
@@ -250,32 +268,34 @@ class LinkingChain:
         self._missed_in_a_row = 0
         self._optional = set()
         self._own.pop(balise.balise_id, None)
-        announced = self._in_order_of_travel() if self.linking else _Announced([], 1)
+        announced = self._announced_balises() if self.linking else _Announced([], 1)
         self._expect(announced, announced.first_beyond(balise.path_m))
 
-    def _in_order_of_travel(self) -> _Announced:
+    def _announced_balises(self) -> _Announced:
+        """The announced balises of the leg, valid in the direction of travel, in order of travel."""
         leg = self._leg
         direction = self._direction
         if (leg, direction) not in self._announced_ahead:
-            valid = [balise for balise in self._linked if balise.leg == leg and balise.is_valid(direction)]
+            valid = [balise for balise in self._linked if balise.leg == leg and balise.is_valid_for(direction)]
             self._announced_ahead[leg, direction] = _Announced(valid[::direction], direction)
         return self._announced_ahead[leg, direction]
 
     def _expect(self, announced: _Announced, first: int) -> None:
+        """Expect these balises, from the one at place `first` on."""
         self._ahead = announced
         self._next = first
         self.closing_m = float("inf")
         if first < len(announced.balises) and self.reference is not None and self.reference.odometer_m is not None:
             start_m = self.reference.odometer_m * self._direction
-            self.closing_m = start_m + self._window(announced.balises[first]).close_m
+            self.closing_m = start_m + self._window_of(announced.balises[first]).close_m
 
-    def _passage_of(self, crossing: Crossing) -> Passage:
-        """A new passage, or one whose window closed before."""
+    def _offered_passage(self, crossing: Crossing) -> Passage:
+        """The passage of an offer: a new one, or that whose window closed before."""
         name = crossing.balise.balise_id
         forward = crossing.sense == crossing.direction
         passage = self._unoffered.pop(name, None) if forward else None
         if passage is None:
-            passage = self._new_passage(crossing.balise, crossing.t_ns, crossing.direction)
+            passage = self._add_passage(crossing.balise, crossing.t_ns, crossing.direction)
             self._own.pop(name, None)
             if forward:
                 self._own[name] = passage
@@ -283,10 +303,11 @@ class LinkingChain:
         passage.t_ns = crossing.t_ns
         return passage
 
-    def _new_passage(self, balise: Balise, t_ns: int, direction: int) -> Passage:
+    def _add_passage(self, balise: Balise, t_ns: int, direction: int) -> Passage:
+        """Add a passage, with its window if the balise is still ahead."""
         passage = Passage(balise, t_ns, direction)
         if self._ahead.place_of(balise.balise_id, self._next) is not None:
-            passage.window = self._window(balise)
+            passage.window = self._window_of(balise)
         if self.reference is not None and self.reference.odometer_m is not None:
             along_m = balise.path_m - self.reference.balise.path_m
             passage.announced_odometer_m = self.reference.odometer_m + along_m

@@ -1,4 +1,4 @@
-"""Balises as the train meets them: what the position crosses and the reader reads, offered to the linking chains."""
+"""The walk of the LDS along the epochs: balises offered to the linking chains, and whether the position is in use."""
 
 from __future__ import annotations
 
@@ -12,11 +12,19 @@ from pipeline.stages.lds.crossings import (
     Disarmed,
     Journey,
     mission_epochs,
-    odometer_epochs,
+    odometer_doubt_epochs,
     turning_epochs,
     unwatched_epochs,
 )
-from pipeline.stages.lds.link_monitors import Anchor, Held, LinkDistance, LinkOrder, Recovery, Relink, disorder
+from pipeline.stages.lds.link_monitors import (
+    Anchor,
+    Held,
+    LinkDistance,
+    LinkOrder,
+    Recovery,
+    Relink,
+    count_out_of_order,
+)
 from pipeline.stages.lds.linking import LinkingChain, LrvbChange
 from pipeline.stages.monitors.bank import MonitorBank
 from schemas.arrays import NS_PER_S
@@ -54,6 +62,7 @@ class BaliseDetection:
         return min(self.virtual.closing_m, self.physical.closing_m)
 
     def turn(self, epoch: int) -> None:
+        """Tell the chains of a turn, where there is one at this epoch."""
         for chain in (self.virtual, self.physical) if epoch in self._turns else ():
             chain.turn(self._journey, epoch)
 
@@ -63,7 +72,7 @@ class BaliseDetection:
         return [read for read in reads if not self._disarmed.holds(read.balise) and self._offer(read, None)]
 
     def pass_virtual(self, epoch: int, distrusted: bool, entering: bool) -> tuple[list[Crossing], bool]:
-        """What was accepted of this step's crossings, and is the order of identities broken?
+        """The crossings of this step that are accepted, and whether the order of identities is broken.
 
         `distrusted`: negated, withheld, or a monitor fails; `entering`: no chain has begun.
         """
@@ -84,31 +93,36 @@ class BaliseDetection:
         return accepted, self._order_fails(epoch, offered, overdue)
 
     def rearm(self, begin: int, end: int) -> None:
-        """By these epochs, at none of which a balise is crossed after the first."""
+        """Re-arm balises by these epochs, at none of which a balise is crossed after the first."""
         if self._disarmed:
             self._disarmed.rearm(begin, end)
 
     def close_windows(self, epoch: int, t_ns: int) -> None:
+        """Close the windows that end before the odometer of this epoch."""
         along_m = self._along_m[epoch]
         if along_m > self.virtual.closing_m:
-            self.virtual.advance(float(self._journey.odometer_m[epoch]), t_ns, self._absence(epoch))
+            self.virtual.advance(float(self._journey.odometer_m[epoch]), t_ns, self._absence_status(epoch))
         if along_m > self.physical.closing_m:
             self.physical.advance(float(self._journey.odometer_m[epoch]), t_ns, PassageStatus.MISSED)
 
     def finish(self, t_ns: int) -> None:
-        """Balises that the train has passed by its odometer when the run ends without a position."""
-        known = self._journey.on_odometer
-        absence = self._absence(len(self._along_m) - 1) if known.size else PassageStatus.MISSED
+        """Add the balises that the train has passed by its odometer when the run ends without a position."""
+        known = self._journey.with_odometer
+        absence = self._absence_status(len(self._along_m) - 1) if known.size else PassageStatus.MISSED
         if absence is not PassageStatus.MISSED:
             self.virtual.finish(float(self._journey.odometer_m[known[-1]]), t_ns, absence)
 
     def _offer(self, crossing: Crossing, refusal: PassageStatus | None) -> bool:
+        """Offer a crossing to its chain; whether it is accepted."""
         chain = self.virtual if crossing.balise.kind is BaliseKind.VIRTUAL else self.physical
         self._disarmed.add(crossing)
         return chain.offer(crossing, refusal)
 
     def _refusal_of(self, crossing: Crossing, distrusted: bool, entering: bool) -> PassageStatus | None:
-        """Why this crossing is no detection. A step out of an ambiguous position crosses what the train did not."""
+        """Why this crossing is no detection; None where it is one.
+
+        A step out of an ambiguous position crosses what the train did not.
+        """
         if distrusted:
             # "The noise is known and no monitor has failed" is one condition of a detection (DOMAIN section 4).
             return PassageStatus.REJECTED_MONITOR
@@ -120,14 +134,15 @@ class BaliseDetection:
             return PassageStatus.REJECTED_MONITOR
         return refusal
 
-    def _absence(self, epoch: int) -> PassageStatus:
+    def _absence_status(self, epoch: int) -> PassageStatus:
         """The status of a balise passed by the train, but not by the position."""
         return self._journey.absence(slice(epoch, epoch + 1)) if self._journey.blind[epoch] else PassageStatus.MISSED
 
     def _order_fails(self, epoch: int, offered: list[Crossing], overdue: int) -> bool:
+        """Note and return whether balises of this step were offered out of order."""
         if not self.order.is_evaluated(epoch):
             return False
-        out_of_order = disorder(offered, overdue, self._journey, self._config)
+        out_of_order = count_out_of_order(offered, overdue, self._journey, self._config)
         self.order.note(epoch, out_of_order)
         return out_of_order > 0
 
@@ -175,11 +190,13 @@ class LocationSystem:
         self.withheld_for: list[LostTo | None] = [None] * journey.t_ns.size
         # The walk reads single elements: lists are several times faster at that than arrays.
         self._t_ns: list[int] = journey.t_ns.tolist()
-        self._way_m = journey.odometer_m * journey.direction
+        self._odometer_along_m = journey.odometer_m * journey.direction
         self._unwatched = unwatched_epochs(journey, bank.watched, config.align.gap_reset_s)
         self._bridged_ns = round(config.align.gap_reset_s * NS_PER_S)
         self._missions = mission_epochs(journey, config.lds)
-        self._events = sorted({*self.balises.events, *self._unwatched, *self._missions, *odometer_epochs(journey)})
+        self._events = sorted(
+            {*self.balises.events, *self._unwatched, *self._missions, *odometer_doubt_epochs(journey)}
+        )
         self._relink = Relink(journey, self.tvb, config)
         self._use = Use.IN_USE
         self._slipped = False  # withheld for slip
@@ -192,9 +209,11 @@ class LocationSystem:
 
     @property
     def held(self) -> list[Held]:
+        """The re-links that held."""
         return self._relink.held
 
     def run(self) -> None:
+        """Walk from the first epoch to the last."""
         epoch = 0
         while epoch < len(self._t_ns):
             if (end := self._uneventful_until(epoch)) > epoch:
@@ -212,7 +231,7 @@ class LocationSystem:
 
         Uneventful is a position in use, in a begun chain, up to the next event, alarm or end of a window.
         """
-        if self._use is not Use.IN_USE or self._withheld_for(epoch) is not None or self._hidden_ns is not None:
+        if self._use is not Use.IN_USE or self._withheld_cause(epoch) is not None or self._hidden_ns is not None:
             return epoch
         if self._chain_from is None or epoch <= self._chain_from:
             return epoch
@@ -221,18 +240,20 @@ class LocationSystem:
         end = self._next_event(epoch)
         for monitors in (self._bank, self.distance):
             end = monitors.quiet_until(epoch, end) if end > epoch else epoch
-        return self._first_closing(epoch, end)
+        return self._first_window_end(epoch, end)
 
     def _next_event(self, epoch: int) -> int:
+        """The first event at this epoch or later; the number of epochs where none is left."""
         near = bisect_left(self._events, epoch)
         return self._events[near] if near < len(self._events) else len(self._t_ns)
 
-    def _first_closing(self, epoch: int, end: int) -> int:
-        """The first epoch before `end` at which the window of a balise closes."""
-        closing = self._way_m[epoch:end] > self.balises.closing_m
+    def _first_window_end(self, epoch: int, end: int) -> int:
+        """The first epoch before `end` at which the window of a balise closes, else `end`."""
+        closing = self._odometer_along_m[epoch:end] > self.balises.closing_m
         return epoch + int(closing.argmax()) if closing.any() else end
 
     def _pass_uneventful(self, epoch: int, end: int) -> None:
+        """Write the epochs before `end` as uneventful."""
         evaluated = self._bank.along_evaluated_between(epoch, end)
         self.evaluated[epoch:end] = evaluated.tolist()
         self.tvb[epoch:end] = (evaluated & self._journey.usable[epoch:end]).tolist()
@@ -241,12 +262,13 @@ class LocationSystem:
 
     def _hidden_until(self, epoch: int) -> int:
         """The first epoch from here on for `_step`; before it the noise is unknown, and nothing was validated yet."""
-        if self._use is not Use.IN_USE or self._validated or self.distance.measures:
+        if self._use is not Use.IN_USE or self._validated or self.distance.has_anchor:
             return epoch
         end = self._next_event(epoch)
-        return self._first_closing(epoch, self._bank.hidden_until(epoch, end)) if end > epoch else epoch
+        return self._first_window_end(epoch, self._bank.hidden_until(epoch, end)) if end > epoch else epoch
 
     def _pass_hidden(self, epoch: int, end: int) -> None:
+        """Write the epochs before `end` as withheld for noise."""
         self.withheld_for[epoch:end] = [LostTo.NOISE] * (end - epoch)
         self._hidden_ns = self._t_ns[epoch] if self._hidden_ns is None else self._hidden_ns
         if self._journey.slips[epoch:end].any():
@@ -254,6 +276,7 @@ class LocationSystem:
         self.balises.rearm(epoch, end)
 
     def _step(self, epoch: int) -> None:
+        """One epoch: telegrams, use, crossings, windows, alarm, then negation, return or validation."""
         if epoch in self._missions:
             self._relink.begin_mission(epoch)
             self._initialise_anew(epoch)
@@ -263,15 +286,15 @@ class LocationSystem:
                 continue  # behind the last epoch: the position was no longer there to learn of it
             self._relink.note_read(read)
             if self._relink.is_held(epoch):
-                self.distance.hold_to(epoch, *self._relink.held_m(epoch))
+                self.distance.hold_to_relink_anchor(epoch, *self._relink.movement_in_hold_m(epoch))
         bank_failed = self._bank.failed(epoch)
         self._watch(epoch)
-        self.withheld_for[epoch] = self._withheld_for(epoch)
+        self.withheld_for[epoch] = self._withheld_cause(epoch)
         withheld = self.withheld_for[epoch] is not None
         distrusted = bank_failed or self.distance.fails(epoch) or self._use is Use.NEGATED or withheld
         accepted, disordered = self.balises.pass_virtual(epoch, distrusted, self._chain_from is None)
         for crossing in accepted:
-            self._accept(crossing, epoch)
+            self._accept_crossing(crossing, epoch)
         self.balises.rearm(epoch, epoch + 1)
         self.balises.close_windows(epoch, self._t_ns[epoch])
         self.evaluated[epoch] = self._bank.along_evaluated(epoch)
@@ -283,7 +306,8 @@ class LocationSystem:
         elif self.evaluated[epoch] and self._journey.usable[epoch] and not withheld:
             self._validate(epoch)
 
-    def _withheld_for(self, epoch: int) -> LostTo | None:
+    def _withheld_cause(self, epoch: int) -> LostTo | None:
+        """Why the position is withheld at this epoch; None where it is not."""
         if not self._bank.noise_known_at(epoch):
             return LostTo.NOISE
         if self._journey.slips[epoch]:
@@ -305,7 +329,7 @@ class LocationSystem:
             self._return_unsuspected(epoch)
 
     def _was_hidden(self, epoch: int) -> bool:
-        """Noise hid what the position did, for longer than the bank bridges, until this epoch."""
+        """Whether noise hid what the position did, for longer than the bank bridges, until this epoch."""
         if not self._bank.noise_known_at(epoch):
             self._hidden_ns = self._t_ns[epoch] if self._hidden_ns is None else self._hidden_ns
             return False
@@ -313,27 +337,29 @@ class LocationSystem:
         return since_ns is not None and self._t_ns[epoch] - since_ns > self._bridged_ns
 
     def _withhold(self, epoch: int, slipped: bool) -> None:
+        """Leave use without an alarm; `slipped`: for slip of the odometer."""
         self._relink.withhold(epoch, suspected=slipped)
         self._slipped = slipped
         self._use = Use.WITHHELD
 
     def _can_return(self, epoch: int) -> bool:
-        """A usable position that the odometer can be compared with, and whose noise is known."""
+        """Whether the odometer can be compared with a usable position whose noise is known."""
         return bool(self._journey.comparable[epoch]) and self._bank.noise_known_at(epoch)
 
     def _return_unsuspected(self, epoch: int) -> None:
+        """Re-link a withheld position: back in use where it holds, an alarm where it has moved."""
         comparison = self._relink.compare(epoch)
         if comparison.holds:
             self._use = Use.IN_USE
-            self._hold(epoch)
+            self._hold_to_anchor(epoch)
             if self._slipped:
                 self.distance.measure_from(Anchor.at_epoch(self._journey, epoch), epoch)
         if not self._slipped:
             # That it has moved is an alarm, unless the odometer itself is in doubt.
-            self.distance.hold_against(comparison, epoch)
+            self.distance.note_comparison(comparison, epoch)
 
-    def _accept(self, crossing: Crossing, epoch: int) -> None:
-        """It is the LRVB and begins the chain of TVBs."""
+    def _accept_crossing(self, crossing: Crossing, epoch: int) -> None:
+        """An accepted balise is the LRVB and begins the chain of TVBs."""
         self.accepted_at_ns[epoch] = crossing.t_ns
         crossing.initialising = not self._validated
         self._validated = True
@@ -351,7 +377,7 @@ class LocationSystem:
                 self.distance.measure_from(Anchor.at_epoch(self._journey, epoch), epoch)
 
     def _has_initialised(self, epoch: int) -> bool:
-        """Consistent for `init_s`: a TVB may arise between two VBs (SR)."""
+        """Whether the position was consistent for `init_s`; a TVB may arise between two VBs (SR)."""
         t_ns = self._t_ns[epoch]
         if self._consistent_since_ns is None or t_ns - self._consistent_at_ns > self._journey.gap_ns[epoch]:
             self._consistent_since_ns = t_ns
@@ -363,6 +389,7 @@ class LocationSystem:
         return True
 
     def _negate(self, epoch: int) -> None:
+        """Negate the position after an alarm."""
         self._relink.withhold(epoch, suspected=True)
         self._bank.freeze(epoch)
         self._use = Use.NEGATED
@@ -371,7 +398,7 @@ class LocationSystem:
         self._consistent_since_ns = None
 
     def _seek_return(self, epoch: int, disordered: bool) -> None:
-        """Return after recovery if the position re-links, or anew where nothing was validated before."""
+        """Return to use after recovery if the position re-links, or anew where nothing was validated before."""
         self.negated[epoch] = True
         if not self._recovery.is_over(epoch, self.evaluated[epoch], disordered):
             return
@@ -381,27 +408,27 @@ class LocationSystem:
         if not self._relink.compare(epoch).holds:
             self.withheld_for[epoch] = LostTo.RELINK
             return
-        self._return(epoch)
-        self._hold(epoch)
+        self._return_to_use(epoch)
+        self._hold_to_anchor(epoch)
         self.distance.measure_from(Anchor.at_epoch(self._journey, epoch), epoch)
 
-    def _hold(self, epoch: int) -> None:
+    def _hold_to_anchor(self, epoch: int) -> None:
         """From a return on the distance since the anchor counts, while the slow averages cannot see a drift go on."""
         self._relink.hold(epoch)
-        self.distance.hold_to(epoch, *self._relink.held_m(epoch))
+        self.distance.hold_to_relink_anchor(epoch, *self._relink.movement_in_hold_m(epoch))
 
     def _initialise_anew(self, epoch: int) -> None:
-        """A start of mission, or a fault before anything was validated."""
+        """Begin without LRVB and chain: a start of mission, or a fault before anything was validated."""
         self.balises.virtual.forget()
         self.distance.forget(epoch)
         self._chain_from = self._consistent_since_ns = None
         self._validated = False
         if self._use is Use.NEGATED:
-            self._return(epoch)
+            self._return_to_use(epoch)
         self._use = Use.IN_USE
         self._note_lrvb(epoch)
 
-    def _return(self, epoch: int) -> None:
+    def _return_to_use(self, epoch: int) -> None:
         """In use again, but withheld at this epoch, from which the bank restarts."""
         self._use = Use.IN_USE
         self.negated[epoch] = False
@@ -412,4 +439,5 @@ class LocationSystem:
         self.alarm[epoch] = self._bank.failed(epoch)
 
     def _note_lrvb(self, epoch: int) -> None:
+        """Note which LRVB is in force from this epoch on."""
         self.lrvb_changes.append(LrvbChange(epoch, self.balises.virtual.reference, self._chain_from is not None))

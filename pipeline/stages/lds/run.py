@@ -15,10 +15,10 @@ from pipeline.stages.lds.crossings import (
     Journey,
     Passage,
     arrays_of_crossings,
-    balises_of,
+    balises_of_kind,
     find_crossings,
     in_order_of_time,
-    reads_of,
+    telegrams_on_path,
 )
 from pipeline.stages.lds.link_monitors import Held
 from pipeline.stages.lds.linking import LrvbChange
@@ -77,36 +77,37 @@ def run_lds(
         DOMAIN section 4; SUBSET-026 3.4.4 and 3.6.4; TVB section 3.
     """
     journey = Journey(epochs, scale_sigma, config)
-    on_path = {kind: balises_of(balises, kind) for kind in BaliseKind}
-    reads, unknown = reads_of(balise_reads, on_path[BaliseKind.PHYSICAL], journey)
+    on_path = {kind: balises_of_kind(balises, kind) for kind in BaliseKind}
+    reads, unknown = telegrams_on_path(balise_reads, on_path[BaliseKind.PHYSICAL], journey)
     crossings = in_order_of_time([*find_crossings(journey, on_path[BaliseKind.VIRTUAL]), *reads])
     system = LocationSystem(journey, bank, on_path, crossings, config)
     system.run()
     passages = system.balises.virtual.passages + system.balises.physical.passages
     return LdsResult(
-        epochs=_epochs(system, journey, config.lds),
+        epochs=_lds_epochs(system, journey, config.lds),
         linking={"link_order": system.balises.order.verdicts(), "link_distance": system.distance.verdicts()},
         crossings=arrays_of_crossings(crossings),
-        passages=passage_rows(passages, crossings, journey, solution),
+        passages=passages_table(passages, crossings, journey, solution),
         unknown_reads=unknown,
         held=tuple(system.held),
     )
 
 
-def _epochs(system: LocationSystem, journey: Journey, config: LdsConfig) -> LdsEpochs:
+def _lds_epochs(system: LocationSystem, journey: Journey, config: LdsConfig) -> LdsEpochs:
+    """What the walk left of each epoch, as columns."""
     changes = system.lrvb_changes
     starts = np.array([change.epoch for change in changes])
     index = np.searchsorted(starts, np.arange(journey.t_ns.size), side="right") - 1
     names = [None if change.lrvb is None else change.lrvb.balise.balise_id for change in changes]
     numbers = {name: number for number, name in enumerate(dict.fromkeys(name for name in names if name is not None))}
-    distance_m, doubt_m = _reported_m(changes, index, journey, config)
+    distance_m, doubt_m = _reported_distances_m(changes, index, journey, config)
     withheld_for = np.full(journey.t_ns.size, -1)
     for epoch, cause in enumerate(system.withheld_for):
         if cause is not None:
             withheld_for[epoch] = _LOST_TO[cause]
     withheld = withheld_for >= 0
     return LdsEpochs(
-        lds_mode=_modes(system, index, journey, withheld),
+        lds_mode=_lds_modes(system, index, journey, withheld),
         tvb=np.array(system.tvb, dtype=np.bool_),
         lrvb=np.array([-1 if name is None else numbers[name] for name in names], dtype=np.int64)[index],
         lrvb_ids=list(numbers),
@@ -132,8 +133,8 @@ def _diagnosis_faulty(system: LocationSystem, journey: Journey, withheld: Bools)
     return faulty
 
 
-def _modes(system: LocationSystem, index: Ints, journey: Journey, withheld: Bools) -> Ints:
-    """By number in `LdsMode`; `index`: the change of LRVB in force at each epoch."""
+def _lds_modes(system: LocationSystem, index: Ints, journey: Journey, withheld: Bools) -> Ints:
+    """Mode of the LDS at each epoch, by number in `LdsMode`; `index`: the change of LRVB in force there."""
     linked = np.array(
         [
             (change.lrvb is not None and change.lrvb.odometer_m is not None)
@@ -147,8 +148,10 @@ def _modes(system: LocationSystem, index: Ints, journey: Journey, withheld: Bool
     return np.where(system.negated, modes.index(LdsMode.FAIL_SAFE), mode)
 
 
-def _reported_m(changes: list[LrvbChange], index: Ints, journey: Journey, config: LdsConfig) -> tuple[Floats, Floats]:
-    """Odometer distance since the LRVB, and by how much it over- or under-reads (SUBSET-026 3.6.4)."""
+def _reported_distances_m(
+    changes: list[LrvbChange], index: Ints, journey: Journey, config: LdsConfig
+) -> tuple[Floats, Floats]:
+    """Odometer distance since the LRVB [m], and by how much it may over- or under-read (SUBSET-026 3.6.4)."""
     values = [
         (np.nan, np.nan, np.nan)
         if (lrvb := change.lrvb) is None
@@ -166,7 +169,7 @@ def _reported_m(changes: list[LrvbChange], index: Ints, journey: Journey, config
 
 
 def _exposure_s(system: LocationSystem, journey: Journey) -> Floats:
-    """Time since the last TVB or accepted VB before this epoch's own: TVB eq. 7; an outage shows."""
+    """Time since the last TVB or accepted VB before each epoch's own [s] (TVB eq. 7); an outage shows."""
     never = np.iinfo(np.int64).min
     validated_ns = np.where(system.tvb, journey.t_ns, never)
     before_ns = np.concatenate(([never], validated_ns[:-1]))[: journey.t_ns.size]
@@ -179,18 +182,20 @@ def _exposure_s(system: LocationSystem, journey: Journey) -> Floats:
     return exposure_s
 
 
-def passage_rows(
+def passages_table(
     passages: Sequence[Passage], crossings: Sequence[Crossing], journey: Journey, solution: str
 ) -> pl.DataFrame:
+    """The passages as rows of the contract, in order of time."""
     ids = {id(crossing): number for number, crossing in enumerate(crossings)}
-    rows = [_row(passage, ids, journey, solution) for passage in passages]
+    rows = [_passage_row(passage, ids, journey, solution) for passage in passages]
     when = [row["t_offered"] or row["t_reckoned"] or passage.t_ns for row, passage in zip(rows, passages, strict=True)]
     order = sorted(range(len(rows)), key=lambda number: (when[number], passages[number].balise.balise_id))
     schema = dtypes(Passages) | {"t_reckoned": pl.Datetime("ns", "UTC")}
     return pl.DataFrame([rows[number] for number in order], schema=schema)
 
 
-def _row(passage: Passage, ids: dict[int, int], journey: Journey, solution: str) -> dict[str, object]:
+def _passage_row(passage: Passage, ids: dict[int, int], journey: Journey, solution: str) -> dict[str, object]:
+    """One passage as a row; `ids`: number of each crossing by its identity."""
     balise = passage.balise
     window = passage.window
     crossing = passage.crossing
@@ -213,15 +218,15 @@ def _row(passage: Passage, ids: dict[int, int], journey: Journey, solution: str)
         "initialising": crossing is not None and crossing.initialising,
         "location_accuracy_m": balise.accuracy_m,
         "crossing_id": crossing and ids[id(crossing)],
-        "t_reckoned": _reckoned_ns(passage, journey),
+        "t_reckoned": _reckoned_passing_ns(passage, journey),
     }
 
 
-def _reckoned_ns(passage: Passage, journey: Journey) -> int | None:
-    """When the odometer last passed the announced place before the passage was settled."""
+def _reckoned_passing_ns(passage: Passage, journey: Journey) -> int | None:
+    """When the odometer last passed the announced place before the passage was settled [ns]; None if offered."""
     if passage.crossing is not None or passage.announced_odometer_m is None:
         return None
-    known = journey.on_odometer
+    known = journey.with_odometer
     rows = known[: int(np.searchsorted(journey.t_ns[known], passage.t_ns, side="right"))]
     passed = passings(journey.odometer_m[rows], [passage.announced_odometer_m])
     if not passed:

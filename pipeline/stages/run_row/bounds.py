@@ -38,7 +38,7 @@ def poisson_rate(events: int, exposure_h: float, confidence: float = CONFIDENCE)
 
     Without exposure nothing is known.
     """
-    _check(events, confidence)
+    _require_valid(events, confidence)
     if not exposure_h > 0:
         return UNKNOWN
     tail = (1.0 - confidence) / 2.0
@@ -49,13 +49,13 @@ def poisson_rate(events: int, exposure_h: float, confidence: float = CONFIDENCE)
 
 def poisson_rate_upper(events: int, exposure_h: float) -> float | None:
     """One-sided upper bound of a rate [1/h], the one a THR claim needs: zero events give 3.00/T."""
-    _check(events)
+    _require_valid(events)
     return float(gammaincinv(events + 1, CONFIDENCE)) / exposure_h if exposure_h > 0 else None
 
 
 def clopper_pearson(successes: int, trials: int, confidence: float = CONFIDENCE) -> Estimate:
     """Share of independent trials with exact two-sided bounds (Clopper and Pearson 1934)."""
-    _check(successes, confidence)
+    _require_valid(successes, confidence)
     if trials < successes:
         raise ValueError(f"{successes} successes out of {trials} trials")
     if trials == 0:
@@ -72,7 +72,7 @@ def hours_to_substantiate(rate_per_h: float, events: int = 0) -> float:
 
     One-sided: 0.67e-9/h needs 4.47e9 h without any event.
     """
-    _check(events)
+    _require_valid(events)
     if not rate_per_h > 0:
         raise ValueError(f"a rate of {rate_per_h} 1/h cannot be substantiated")
     return float(gammaincinv(events + 1, CONFIDENCE)) / rate_per_h
@@ -83,7 +83,8 @@ def hours_still_needed(rate_per_h: float, events: int, exposure_h: float) -> flo
     return max(0.0, hours_to_substantiate(rate_per_h, events) - exposure_h)
 
 
-def _check(events: int, confidence: float = CONFIDENCE) -> None:
+def _require_valid(events: int, confidence: float = CONFIDENCE) -> None:
+    """Refuse negative counts, and confidences that are no probability."""
     if events < 0:
         raise ValueError(f"{events} events")
     if not 0.0 < confidence < 1.0:
@@ -101,7 +102,7 @@ def columns_of(name: str, estimate: Estimate, unit: str = "") -> dict[str, objec
 
 
 def with_estimates(frame: pl.DataFrame, *estimates: Estimator) -> pl.DataFrame:
-    """The columns of estimates, row by row; not known where their events are not."""
+    """The table with the columns of each estimate, row by row; not known where its events are not."""
     series = []
     for name, unit, estimate, events, against in estimates:
         pairs = zip(frame[events].to_list(), frame[against].to_list(), strict=True)
@@ -111,35 +112,35 @@ def with_estimates(frame: pl.DataFrame, *estimates: Estimator) -> pl.DataFrame:
     return frame.with_columns(series)
 
 
-def bounds_of(names: Collection[str]) -> dict[str, tuple[str, str]]:
-    """Per figure that has bounds the columns that hold them: `mtbf_low_h` and `mtbf_high_h` of `mtbf_h`."""
+def bound_columns(names: Collection[str]) -> dict[str, tuple[str, str]]:
+    """The columns of the bounds of each figure that has some: `mtbf_low_h` and `mtbf_high_h` of `mtbf_h`."""
     parts = [(low.rpartition("_low"), low) for low in names if "_low" in low]
     pairs = {head + unit: (low, f"{head}_high{unit}") for (head, _, unit), low in parts}
     return {figure: pair for figure, pair in pairs.items() if {figure, *pair} <= set(names)}
 
 
-def continuity(t_s: float, mtbf_h: float) -> float:
-    """Probability of working through `t_s`, having worked at its beginning (LOC eq. 8)."""
+def continuity_over(t_s: float, mtbf_h: float) -> float:
+    """Probability of working through `t_s` [s], having worked at its beginning (LOC eq. 8)."""
     return math.exp(-t_s / 3600.0 / mtbf_h)
 
 
-def mtbf(losses: int, up_h: float) -> Estimate:
-    """MTBF [h] from the losses counted. Without a loss the value is not known, but it has a lower bound."""
+def mtbf_estimate(losses: int, up_h: float) -> Estimate:
+    """MTBF [h] from the losses counted in `up_h`; without a loss not known, but with a lower bound."""
     rate = poisson_rate(losses, up_h)
     return Estimate(*(1.0 / per_h if per_h else None for per_h in (rate.value, rate.high, rate.low)))
 
 
-def continuity_15s(losses: int, up_h: float) -> Estimate:
-    """Continuity over 15 s at the MTBF of so many losses."""
-    hours = mtbf(losses, up_h)
+def continuity_estimate(losses: int, up_h: float) -> Estimate:
+    """Continuity over 15 s at the MTBF of so many losses in `up_h`."""
+    hours = mtbf_estimate(losses, up_h)
     parts = (hours.value, hours.low, hours.high)
-    return Estimate(*(None if part is None else continuity(CONTINUITY_S, part) for part in parts))
+    return Estimate(*(None if part is None else continuity_over(CONTINUITY_S, part) for part in parts))
 
 
 DETECTION_TIMES = ("time_to_detect_s", "time_since_failure_s", "time_since_failure_may_s")
 
 
-def without_copies(runs: pl.DataFrame) -> pl.DataFrame:
+def without_repeated_runs(runs: pl.DataFrame) -> pl.DataFrame:
     """Rows of `runs` with every recording once, that of the worst verdict: a log under two names has one content.
 
     The content alone (`input_digest`) is not known of runs that came from no file.
@@ -151,22 +152,23 @@ def without_copies(runs: pl.DataFrame) -> pl.DataFrame:
 
 
 def missed_detection() -> pl.Expr:
-    """No monitor failed within the budget of the failure (DIAG's Pmd; DOMAIN section 5.3); null without a failure.
+    """Expression on hazards: no monitor failed within the budget (DIAG's Pmd; DOMAIN 5.3); null without a failure.
 
     Missed for certain counts from `t_failure`, found for certain from `t_failure_may`; between them null.
     """
     budget = (pl.col("budget_s") * 1e9).round().cast(pl.Int64).cast(pl.Duration("ns"))
 
-    def late(since: str) -> pl.Expr:
+    def is_late(since: str) -> pl.Expr:
+        """Not detected within the budget since this instant."""
         undetected = pl.col("t_detected").is_null() | (pl.col("t_detected") > pl.col(since) + budget)
         return pl.col(since).is_not_null() & undetected
 
-    in_time = pl.col("t_failure_may").is_not_null() & ~late("t_failure_may")
-    return pl.when(late("t_failure")).then(True).when(in_time).then(False)
+    in_time = pl.col("t_failure_may").is_not_null() & ~is_late("t_failure_may")
+    return pl.when(is_late("t_failure")).then(True).when(in_time).then(False)
 
 
-def since_when_at_most() -> pl.Expr:
-    """The earliest begin of a failure that the evidence leaves; null where it is silent for one that failed."""
+def earliest_failure() -> pl.Expr:
+    """Expression on hazards: earliest begin of a failure; null where the evidence is silent for one that failed."""
     silent = pl.col("t_failure").is_not_null() & pl.col("t_failure_may").is_null()
     return pl.when(~silent.any()).then(pl.col("t_failure_may").min())
 
@@ -186,7 +188,7 @@ def independent_episodes(hazards: pl.DataFrame) -> pl.DataFrame:
     rows = rows.with_columns(begin=pl.coalesce("t_onset", "t_hazard"), missed=missed_detection())
     episodes = rows.group_by(keys).agg(
         t_failure=pl.col("t_failure").min(),
-        t_failure_may=since_when_at_most(),
+        t_failure_may=earliest_failure(),
         t_end=pl.when(t_end.null_count() == 0).then(t_end.max()),
         budget_s=pl.col("budget_s").first(),
         failed=failed.any(),

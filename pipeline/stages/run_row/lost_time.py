@@ -1,4 +1,4 @@
-"""What moving time without a valid TVB was lost to, and to which monitor (CONTRACT section 3, `lost_to`)."""
+"""What moving time without a valid TVB was lost to, to which monitor (CONTRACT section 3, `lost_to`), and remedies."""
 
 from __future__ import annotations
 
@@ -52,10 +52,11 @@ class LostTime:
 
     @property
     def words(self) -> str:
+        """The losses in a sentence for people."""
         return lost_words(list(self.causes), list(self.causes.values()), self.monitor, self.share)
 
     def columns(self) -> dict[str, object]:
-        """As they stand in `runs`."""
+        """As columns of `runs`."""
         causes = {"lost_to": list(self.causes), "lost_to_share": list(self.causes.values())}
         return {**causes, "lost_to_monitor": self.monitor}
 
@@ -76,7 +77,7 @@ class LostColumns:
     """The first cause that applies, by number in `LostTo`; -1 for none."""
 
     def columns(self) -> list[pl.Series]:
-        """As they stand in `epochs`."""
+        """As columns of `epochs`."""
         words = pl.Series("lost_to", [*(cause.value for cause in LostTo), None], dtype=_LOST_TO)
         return [
             pl.Series("step_s", self.step_s),
@@ -104,7 +105,7 @@ def lost_columns(epochs: JudgedEpochs, config: Configuration) -> LostColumns:
     steps_s = np.diff(clock.t_ns, append=clock.t_ns[-1:]) / NS_PER_S
     gap = clock.held_s < steps_s
     lost = epochs.may_move & (gap | ~epochs.valid)
-    causes = _causes(epochs, gap, config)
+    causes = _loss_conditions(epochs, gap, config)
     numbers = [_NUMBER[cause] for cause in causes]
     first = np.select([lost & applies for applies in causes.values()], numbers, default=-1)
     return LostColumns(steps_s, gap, steps_s * epochs.may_move, steps_s * lost, first)
@@ -128,17 +129,17 @@ def lost_time(epochs: JudgedEpochs, lost: LostColumns, alarms: pl.DataFrame, con
     parts = {cause: float(lost.lost_s[lost.lost_to == _NUMBER[cause]].sum()) / whole_s for cause in LostTo}
     ranked = sorted((cause for cause, part in parts.items() if part > 0.0), key=lambda cause: -parts[cause])
     alarmed = lost.lost_to == _NUMBER[LostTo.ALARM]
-    unexplained = alarmed & ~_explained(alarms, epochs.t_ns, config.lds.recovery_s)
+    unexplained = alarmed & ~_are_explained(alarms, epochs.t_ns, config.lds.recovery_s)
     return LostTime(
         share=float(lost.lost_s.sum()) / whole_s,
         causes={cause: parts[cause] for cause in ranked},
-        monitor=_loudest(epochs.verdicts, alarmed),
+        monitor=_most_failed_monitor(epochs.verdicts, alarmed),
         unfounded=bool(2.0 * lost.lost_s[unexplained].sum() > lost.lost_s[alarmed].sum()),
     )
 
 
-def _causes(epochs: JudgedEpochs, gap: Bools, config: Configuration) -> dict[LostTo, Bools]:
-    """Conditions in the order in which they apply."""
+def _loss_conditions(epochs: JudgedEpochs, gap: Bools, config: Configuration) -> dict[LostTo, Bools]:
+    """The epochs to which each cause applies, in the order in which causes count."""
     negated = epochs.lds_mode == _FAIL_SAFE
     alarm_ns = np.where(epochs.alarm, epochs.t_ns, np.iinfo(np.int64).min)
     # A monitor fails, or has failed less than `recovery_s` ago (DOMAIN section 4).
@@ -158,7 +159,7 @@ def _causes(epochs: JudgedEpochs, gap: Bools, config: Configuration) -> dict[Los
     }
 
 
-def _explained(alarms: pl.DataFrame, t_ns: Ints, recovery_s: float) -> Bools:
+def _are_explained(alarms: pl.DataFrame, t_ns: Ints, recovery_s: float) -> Bools:
     """Epochs of alarm episodes that were due, or that belong to a hazard, and of the recovery after them."""
     due = alarms.filter((pl.col("verdict") == Verdict.TRUE.value) | pl.col("hazard_id").is_not_null())
     ends_ns = times_ns(due, "t_end") + round(recovery_s * NS_PER_S)
@@ -168,7 +169,7 @@ def _explained(alarms: pl.DataFrame, t_ns: Ints, recovery_s: float) -> Bools:
     return inside
 
 
-def _loudest(verdicts: Mapping[str, Verdicts], alarmed: Bools) -> str | None:
+def _most_failed_monitor(verdicts: Mapping[str, Verdicts], alarmed: Bools) -> str | None:
     """The monitor that failed in most of these epochs."""
     if not alarmed.any():
         return None
@@ -199,12 +200,12 @@ class InUse:
     unknown_between_s: float = 0.0
 
     def share(self, part_s: float) -> float:
-        """Of the moving time."""
+        """Share of the moving time."""
         return min(1.0, part_s / self.moving_s) if self.moving_s else 0.0
 
 
-def in_use_of(epochs: JudgedEpochs, moving_s: float) -> InUse:
-    """Of the judged epochs; `moving_s`: moving time."""
+def moving_in_use(epochs: JudgedEpochs, moving_s: float) -> InUse:
+    """Moving time in use of judged epochs, and what of it is unknown; `moving_s`: all moving time [s]."""
     known = epochs.judgements.is_judged
     inside = np.logical_or.accumulate(known) & np.logical_or.accumulate(known[::-1])[::-1]
     used_s = epochs.used_s * (epochs.in_use & epochs.may_move)
@@ -233,14 +234,15 @@ def remedies(
     scarce = run["availability"] is not None and run["availability"] < config.advice.low_availability
 
     def lost_to(*causes: LostTo) -> float:
+        """Share of the moving time that was lost to these causes."""
         return sum(lost.causes.get(cause, 0.0) for cause in causes)
 
-    def costs(*causes: LostTo) -> bool:
-        """Enough of the moving time of a run of low availability was lost to these."""
+    def cost_much(*causes: LostTo) -> bool:
+        """Whether the run has low availability and lost enough of its moving time to these causes."""
         return scarce and lost_to(*causes) >= config.advice.lost_share
 
     healthy = lost.unfounded and not run["faults_injected"]
-    noisy = healthy and lost.monitor in FAST_OF_BANK and costs(LostTo.ALARM, LostTo.RELINK)
+    noisy = healthy and lost.monitor in FAST_OF_BANK and cost_much(LostTo.ALARM, LostTo.RELINK)
     # Some time passes in every run until the noise is known; alone it has to make availability low.
     loud = lost_to(LostTo.NOISE) > 1.0 - config.advice.low_availability
     calibrate = (noisy or loud) and not config.calibration.runs
@@ -250,7 +252,7 @@ def remedies(
     of_gnss = run.get("odometer_origin") in (Origin.GNSS, Origin.FUSED) or Reason.ODOMETER_FOLLOWS_GNSS in reasons
     # Calibration refuses an odometer that may be made of the positions.
     independent = not reasons & {Reason.ODOMETER_ORIGIN_UNKNOWN, Reason.ODOMETER_FOLLOWS_GNSS}
-    late_s = _too_slow_s(run, config)
+    late_s = _time_lost_to_rate_s(run, config)
 
     in_use = used.share(used.in_use_s)
     unknown = used.share(used.unknown_at_ends_s + used.unknown_between_s)
@@ -260,7 +262,7 @@ def remedies(
     table = {
         Remedy.CALIBRATE: (calibrate and independent, noise),
         Remedy.VEHICLE_FILE: (
-            without_scale and independent and (costs(LostTo.RELINK) or unproven),
+            without_scale and independent and (cost_much(LostTo.RELINK) or unproven),
             lost_to(LostTo.RELINK) + unknown,
         ),
         Remedy.REFERENCE: (missing and not truth, unknown),
@@ -272,7 +274,7 @@ def remedies(
             missing and truth and used.unknown_between_s > config.budget_s,
             used.share(used.unknown_between_s),
         ),
-        Remedy.ROUTE: (costs(LostTo.TRACK_AMBIGUOUS), ambiguous),
+        Remedy.ROUTE: (cost_much(LostTo.TRACK_AMBIGUOUS), ambiguous),
         Remedy.CLOCK: (
             # Of the room for an error, the limit to both sides, the clocks alone take half.
             bool(reasons & {Reason.CLOCK_ASSUMED, Reason.EVIDENCE_DISPUTED})
@@ -280,13 +282,13 @@ def remedies(
             unknown,
         ),
         Remedy.ODOMETER: (
-            run["vehicle"] == VehicleFigures.NONE or of_gnss or costs(LostTo.NO_ODOMETER),
+            run["vehicle"] == VehicleFigures.NONE or of_gnss or cost_much(LostTo.NO_ODOMETER),
             lost_to(LostTo.NO_ODOMETER) + of_gnss * in_use,
         ),
         # What such an odometer validates is validated by nothing.
         Remedy.ODOMETER_ORIGIN: (Reason.ODOMETER_ORIGIN_UNKNOWN in reasons and not of_gnss, in_use),
         Remedy.FASTER_LOG: (late_s > 0.0, used.share(late_s)),
-        Remedy.SURVEY_SIGMA: (costs(LostTo.TRACK_AMBIGUOUS) and not survey_stated, ambiguous),
+        Remedy.SURVEY_SIGMA: (cost_much(LostTo.TRACK_AMBIGUOUS) and not survey_stated, ambiguous),
         Remedy.REFERENCE_SIGMA: (False, 0.0),
         Remedy.SURVEY_COMPLETE: (Reason.TRACK_ASSUMED in reasons, unknown),
     }
@@ -294,8 +296,8 @@ def remedies(
     return dict(sorted(gains.items(), key=lambda item: -item[1]))
 
 
-def _too_slow_s(run: Mapping[str, Any], config: Configuration) -> float:
-    """Time of failures beyond the budget that were negated as soon as an epoch allows, and hurt no balise."""
+def _time_lost_to_rate_s(run: Mapping[str, Any], config: Configuration) -> float:
+    """Time of failures beyond the budget [s] that were negated as soon as an epoch allows, and hurt no balise."""
     if not run["gnss_rate_hz"]:
         return 0.0
     period_s = 1.0 / run["gnss_rate_hz"]

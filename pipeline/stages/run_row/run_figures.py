@@ -1,4 +1,7 @@
-"""The verdict of a run (DOMAIN section 5.4), by service level too (TVB eq. 7)."""
+"""Figures of a `runs` row: availability, accuracy, balises, hazards, alarms, states.
+
+Reasons and verdict (DOMAIN 5.4).
+"""
 
 from __future__ import annotations
 
@@ -12,13 +15,13 @@ import polars as pl
 
 from pipeline.stages.epochs.clock import Clock, availability, outages_s, share_of_time, uptime
 from pipeline.stages.judge.failures import Failure as PositionFailure
-from pipeline.stages.judge.failures import within_budget
+from pipeline.stages.judge.failures import keeps_budget
 from pipeline.stages.judge.judged import JudgedEpochs
 from pipeline.stages.run_row.bounds import (
     CONTINUITY_S,
     UNKNOWN,
     columns_of,
-    continuity,
+    continuity_over,
     independent_episodes,
     poisson_rate,
 )
@@ -78,8 +81,8 @@ def reasons_of(run: RunRow, allowed_s: float, hazards: HazardConfig) -> list[Rea
     Source:
         DOMAIN section 5.4.
     """
-    failures = failures_in(run)
-    within, beyond = level_counts(failures, allowed_s)
+    failures = failures_of_run(run)
+    within, beyond = count_kept_and_exceeded(failures, allowed_s)
     hours_begun = max(1, math.ceil((run["duration_s"] or 0.0) / 3600.0))
     applies = {
         Reason.ACCEPTED_WRONG: run["unsafe_accepted"] > 0,
@@ -130,35 +133,35 @@ def level_rows(run: RunRow, config: Configuration) -> list[dict[str, object]]:
     Source:
         TVB eq. 7.
     """
-    failures = failures_in(run)
+    failures = failures_of_run(run)
     in_time = ThrVerdict.KEPT if failures else ThrVerdict.NO_FAILURE
     rows: list[dict[str, object]] = []
     for level in config.safety.service_levels:
         allowed_s = config.safety.allowed_time_to_detect_s(level)
-        within, exceeded = level_counts(failures, allowed_s)
+        within, exceeded = count_kept_and_exceeded(failures, allowed_s)
         verdict = verdict_of(reasons_of(run, allowed_s, config.hazards))
         values = (level, allowed_s, within, exceeded, _OF_LEVEL.get(verdict, in_time).value)
         rows.append(dict(zip(LEVEL_LISTS, values, strict=True)))
     return rows
 
 
-def failures_in(run: RunRow) -> list[Failure]:
+def failures_of_run(run: RunRow) -> list[Failure]:
     """The failures of one `runs` row, in order of time."""
     lists = ("failure_hazardous_s", "failure_hazardous_may_s", "failure_accepted")
     return list(zip(*(run[name] or [] for name in lists), strict=True))
 
 
-def level_counts(failures: Sequence[Failure], allowed_s: float) -> tuple[int, int]:
-    """How many failures kept the allowed time whatever is unknown, and how many did not for certain."""
-    kept = [within_budget(spent_s, may_s, Judgement(accepted), allowed_s) for spent_s, may_s, accepted in failures]
+def count_kept_and_exceeded(failures: Sequence[Failure], allowed_s: float) -> tuple[int, int]:
+    """How many failures kept the allowed time [s] whatever is unknown, and how many certainly exceeded it."""
+    kept = [keeps_budget(spent_s, may_s, Judgement(is_accepted), allowed_s) for spent_s, may_s, is_accepted in failures]
     return kept.count(True), kept.count(False)
 
 
 Row = dict[str, Any]
 
 
-def positions(epochs: JudgedEpochs, clock: Clock, config: Configuration) -> Row:
-    """Availability, outages and continuity (CONTRACT section 3; LOC eq. 8).
+def availability_figures(epochs: JudgedEpochs, clock: Clock, config: Configuration) -> Row:
+    """Columns of availability, outages and continuity (CONTRACT section 3; LOC eq. 8).
 
     Time of which nobody knows whether the train moved counts as moving, and a TVB in it does not (DOMAIN section 5.5).
     """
@@ -172,27 +175,27 @@ def positions(epochs: JudgedEpochs, clock: Clock, config: Configuration) -> Row:
         "longest_outage_s": float(lost_s.max(initial=0.0)) if epochs.height else None,
         "cross_bias_m": _median_m(epochs.cross_track_m[epochs.on_track]),
         "mtbf_h": mtbf_h,
-        "continuity_15s": continuity(CONTINUITY_S, mtbf_h) if mtbf_h else None,
+        "continuity_15s": continuity_over(CONTINUITY_S, mtbf_h) if mtbf_h else None,
         "trusted_s": trust.up_s if epochs.height else None,
         "trusted_losses": trust.losses,
     }
 
 
 def _median_m(values_m: Floats) -> float | None:
-    """Of those that are known; None without any."""
+    """Median of the values that are known [m]; None without any."""
     known_m = values_m[np.isfinite(values_m)]
     return median(known_m) if known_m.size else None
 
 
-def judged() -> pl.Expr:
-    """The evidence calls the position right or wrong (DOMAIN section 5.2)."""
+def is_judged() -> pl.Expr:
+    """Expression on epochs or passages: the evidence calls the position right or wrong (DOMAIN section 5.2)."""
     return pl.col("judgement").is_in([Judgement.RIGHT, Judgement.WRONG])
 
 
 def time_in_use(epochs: JudgedEpochs, recovery_s: float) -> Row:
-    """Time in use, and what of it nobody can judge or nothing diagnoses (DOMAIN section 5.4); all null without epochs.
+    """Columns of time in use, and what of it nobody can judge or nothing diagnoses (DOMAIN section 5.4).
 
-    Shares are of the moving time in use, null without any.
+    Shares are of the moving time in use, null without any. All null without epochs.
     """
     used_s = epochs.used_s
     moves = epochs.may_move
@@ -204,13 +207,13 @@ def time_in_use(epochs: JudgedEpochs, recovery_s: float) -> Row:
         "negated_s": float(negated_s.sum()),
         "share_unknown": share_of_time(used_s[moves], ~judged_rows[moves]),
         "share_undiagnosed": share_of_time(used_s[moves], epochs.undiagnosed[moves]),
-        "unknown_in_use_s": _longest_s(epochs.t_ns, used_s, ~judged_rows & moves & (used_s > 0.0), recovery_s),
+        "unknown_in_use_s": _longest_stretch_s(epochs.t_ns, used_s, ~judged_rows & moves & (used_s > 0.0), recovery_s),
     }
     return figures if epochs.height else dict.fromkeys(figures)
 
 
-def _longest_s(t_ns: Ints, used_s: Floats, where: Bools, apart_s: float) -> float:
-    """Longest time that epochs less than `apart_s` from each other stand for [s]."""
+def _longest_stretch_s(t_ns: Ints, used_s: Floats, where: Bools, apart_s: float) -> float:
+    """Longest time [s] that epochs `where` a condition holds stand for, less than `apart_s` from each other."""
     rows = np.flatnonzero(where)
     breaks = np.flatnonzero(np.diff(t_ns[rows]) >= apart_s * NS_PER_S) + 1
     return max(float(used_s[part].sum()) for part in np.split(rows, breaks))
@@ -221,14 +224,17 @@ def proof_margin_m(epochs: JudgedEpochs, passages: pl.DataFrame, limit_m: float)
     right = epochs.judgements.is_right & epochs.in_use
     margins_m = limit_m - np.fmax(-epochs.judgements.low_m[right], epochs.judgements.high_m[right])
     of_epochs = margins_m[np.isfinite(margins_m)].min(initial=np.inf)
-    of_passages = passages.filter(accepted())["proof_margin_m"].min()
+    of_passages = passages.filter(is_accepted())["proof_margin_m"].min()
     margins = [float(of_epochs)] if np.isfinite(of_epochs) else []
     margins += [of_passages] if isinstance(of_passages, float) else []
     return min(margins, default=None)
 
 
-def spread(error: pl.Expr, name: str, counted: str) -> dict[str, pl.Expr]:
-    """Mean, 95 % and largest of the known errors [m], the latter two of their magnitude, and how many these are."""
+def error_spread(error: pl.Expr, name: str, counted: str) -> dict[str, pl.Expr]:
+    """Expressions for mean, 95 % and largest of the known errors [m], and how many these are.
+
+    The latter two of their magnitude; the names begin with `name`, the count ends with `counted`.
+    """
     size = error.abs()
     return {
         f"{name}_mean_m": error.mean(),
@@ -238,59 +244,62 @@ def spread(error: pl.Expr, name: str, counted: str) -> dict[str, pl.Expr]:
     }
 
 
-def accuracy(epochs: JudgedEpochs) -> Row:
+def accuracy_figures(epochs: JudgedEpochs) -> Row:
+    """Columns of the known errors along, across and above the track."""
     errors: dict[str, pl.Expr] = {}
     for axis in ("along", "cross", "up"):
-        errors |= spread(pl.col(axis), f"{axis}_error", "epochs")
+        errors |= error_spread(pl.col(axis), f"{axis}_error", "epochs")
     known_m = {"along": epochs.error_along_m, "cross": epochs.error_cross_m, "up": epochs.error_up_m}
     return pl.DataFrame(known_m, nan_to_null=True).select(**errors).row(0, named=True)
 
 
-def accepted() -> pl.Expr:
+def is_accepted() -> pl.Expr:
+    """Expression on passages: the LDS accepted the balise."""
     return pl.col("status") == PassageStatus.ACCEPTED
 
 
-def outcomes() -> dict[str, pl.Expr]:
-    """Conditions on passages: what became of the offer."""
+def outcome_conditions() -> dict[str, pl.Expr]:
+    """Expressions on passages, by outcome of the offer."""
     status = pl.col("status")
     return {
-        "accepted": accepted(),
+        "accepted": is_accepted(),
         "rejected": status.cast(pl.String).str.starts_with("rejected_"),
         "missed": status == PassageStatus.MISSED,
         "not_available": status == PassageStatus.NOT_AVAILABLE,
     }
 
 
-def acceptances() -> dict[str, pl.Expr]:
-    """Conditions on passages: acceptances by what the judge says of them; none re-judges."""
-    known = judged().fill_null(value=False)
+def acceptance_conditions() -> dict[str, pl.Expr]:
+    """Expressions on passages: acceptances, by what the judge says of them; none re-judges."""
+    known = is_judged().fill_null(value=False)
     return {
-        "accepted_judged": accepted() & known,
-        "unsafe_accepted": accepted() & _wrong(),
-        "unproven_accepted": accepted() & ~known,
+        "accepted_judged": is_accepted() & known,
+        "unsafe_accepted": is_accepted() & _is_wrong(),
+        "unproven_accepted": is_accepted() & ~known,
         "initialising_accepted": pl.col("initialising"),
     }
 
 
-def _wrong() -> pl.Expr:
+def _is_wrong() -> pl.Expr:
+    """Expression on passages: judged wrong."""
     return (pl.col("judgement") == Judgement.WRONG).fill_null(value=False)
 
 
 def balise_counts(passages: pl.DataFrame) -> Row:
     """What became of the virtual balises, and of those accepted what the judge says of their positions."""
     virtual = passages.filter(pl.col("kind") == enums.BaliseKind.VIRTUAL)
-    return virtual.select(**_of_balises()).row(0, named=True)
+    return virtual.select(**_balise_aggregates()).row(0, named=True)
 
 
 @cache
-def _of_balises() -> dict[str, pl.Expr]:
+def _balise_aggregates() -> dict[str, pl.Expr]:
     """Columns of `runs` over the passages of virtual balises."""
     counts = {"balises_on_path": is_passage()}
-    counts |= {f"balises_{name}": becomes for name, becomes in outcomes().items()} | acceptances()
-    each_once = {"balises_passed": is_passage(), "balises_found": is_passage() & accepted()}
+    counts |= {f"balises_{name}": becomes for name, becomes in outcome_conditions().items()} | acceptance_conditions()
+    each_once = {"balises_passed": is_passage(), "balises_found": is_passage() & is_accepted()}
     return {
         **{name: condition.sum() for name, condition in counts.items()},
-        **spread(pl.col("location_error_m").filter(accepted()), "location_error", "count"),
+        **error_spread(pl.col("location_error_m").filter(is_accepted()), "location_error", "count"),
         **{name: pl.col("balise_id").filter(condition).n_unique() for name, condition in each_once.items()},
     }
 
@@ -301,14 +310,15 @@ def _count_rows(frame: pl.DataFrame, conditions: Mapping[str, pl.Expr]) -> Row:
 
 
 def is_passage() -> pl.Expr:
-    """A row of `passages` that is no offer beyond the passages of the train.
+    """Expression on passages: a row that is no offer beyond the passages of the train.
 
     An offer beyond is one that is judged wrong and for which the evidence knows no true crossing.
     """
-    return ~(pl.col("t_true").is_null() & _wrong())
+    return ~(pl.col("t_true").is_null() & _is_wrong())
 
 
 def hazard_counts(hazards: pl.DataFrame) -> Row:
+    """Columns that count the hazards by class, the faults behind them, and the largest detection times."""
     counts = {kind.counted_as: pl.col("hazard") == kind for kind in enums.Hazard} | {
         "hazards_detected": pl.col("detected"),
         "hazards_within_budget": pl.col("within_budget"),
@@ -320,8 +330,8 @@ def hazard_counts(hazards: pl.DataFrame) -> Row:
     return _count_rows(hazards, counts) | of_faults | {f"{name}_max_s": hazards[f"{name}_s"].max() for name in times}
 
 
-def failure_counts(failures: Sequence[PositionFailure]) -> Row:
-    """Every failure counts, whether it hit a VB or not (DOMAIN section 5.3)."""
+def failure_figures(failures: Sequence[PositionFailure]) -> Row:
+    """Columns of the position failures; every failure counts, whether it hit a VB or not (DOMAIN section 5.3)."""
     within = [failure.within_budget for failure in failures]
     hazardous_s = [failure.hazardous_s for failure in failures]
     return {
@@ -338,17 +348,18 @@ def failure_counts(failures: Sequence[PositionFailure]) -> Row:
 
 
 def _sum_s(times_s: Sequence[float]) -> float:
+    """Sum of times [s]."""
     return float(pl.Series(times_s, dtype=pl.Float64).sum())
 
 
-def service_levels(row: Row, config: Configuration) -> Row:
-    """The row against the allowed T_D of each service level (TVB eq. 7)."""
+def service_level_columns(row: Row, config: Configuration) -> Row:
+    """Columns of the row against the allowed T_D of each service level (TVB eq. 7)."""
     rows = level_rows(row, config)
     return {name: [level[part] for level in rows] for part, name in LEVEL_LISTS.items()}
 
 
-def alarm_counts(alarms: pl.DataFrame, epochs: JudgedEpochs, evidence: enums.Evidence | None) -> Row:
-    """Alarms and the rate of false ones, which needs a reference or balise reads and a verdict on every alarm.
+def alarm_figures(alarms: pl.DataFrame, epochs: JudgedEpochs, evidence: enums.Evidence | None) -> Row:
+    """Columns of alarms and of the rate of false ones, which needs truth and a verdict on every alarm.
 
     The rate counts the time in use in which the along-track bank judged and the position was judged (DOMAIN 6).
     """
@@ -374,7 +385,8 @@ def alarm_counts(alarms: pl.DataFrame, epochs: JudgedEpochs, evidence: enums.Evi
     }
 
 
-def exposure(epochs: JudgedEpochs) -> Row:
+def exposure_figures(epochs: JudgedEpochs) -> Row:
+    """Columns of the exposure time [s]: largest, and 99 %."""
     exposure_s = pl.Series(epochs.exposure_s, nan_to_null=True)
     return {
         "exposure_max_s": exposure_s.max(),
@@ -399,7 +411,10 @@ def state_shares(epochs: JudgedEpochs) -> Row:
 
 
 def stanford_counts(epochs: JudgedEpochs, bound_m: Floats, limit_m: float) -> Row:
-    """Epochs whose error is known to 5 m, by error and bound along the track (CONTRACT section 3, `stanford_*`)."""
+    """Columns that count epochs by error and bound along the track (CONTRACT section 3, `stanford_*`).
+
+    Of those whose error is known to 5 m; `limit_m`: the largest bound that is offered.
+    """
     known = np.isfinite(epochs.error_along_m) & np.isfinite(bound_m)
     error_m = np.abs(epochs.error_along_m[known])
     bound_m = bound_m[known]
@@ -413,7 +428,7 @@ def stanford_counts(epochs: JudgedEpochs, bound_m: Floats, limit_m: float) -> Ro
     return {f"stanford_{name}": int(condition.sum()) for name, condition in counts.items()}
 
 
-def stanford_of_receiver(epochs: JudgedEpochs, limit_m: float) -> Row:
+def stanford_counts_of_receiver(epochs: JudgedEpochs, limit_m: float) -> Row:
     """The same counts with the receiver's protection level as bound; not known where it gives none."""
     counts = stanford_counts(epochs, epochs.hpl_m, limit_m) if np.isfinite(epochs.hpl_m).any() else {}
     return {f"stanford_hpl_{name.removeprefix('stanford_')}": value for name, value in counts.items()}

@@ -1,4 +1,4 @@
-"""What the reader of a `runs` row should know beside its figures: notes, and what makes each of them."""
+"""The `runs` row of one solution, and the notes for its reader."""
 
 from __future__ import annotations
 
@@ -14,27 +14,27 @@ import polars as pl
 from pipeline.stages.epochs.clock import Clock
 from pipeline.stages.epochs.verdicts import NUMBER, Verdicts
 from pipeline.stages.evidence import TrainEvidence
-from pipeline.stages.judge.failures import Failure, failures_within
+from pipeline.stages.judge.failures import Failure, failures_of_part
 from pipeline.stages.judge.judge import Judged
 from pipeline.stages.judge.judged import JudgedEpochs
 from pipeline.stages.matching.epochs import contradictory_covariances
 from pipeline.stages.monitored import MonitoredSolution
 from pipeline.stages.odometry import Odometry
 from pipeline.stages.prepare import Provenance
-from pipeline.stages.run_row.lost_time import LostColumns, LostTime, in_use_of, lost_time, remedies
+from pipeline.stages.run_row.lost_time import LostColumns, LostTime, lost_time, moving_in_use, remedies
 from pipeline.stages.run_row.run_figures import (
-    accuracy,
-    alarm_counts,
+    accuracy_figures,
+    alarm_figures,
+    availability_figures,
     balise_counts,
-    exposure,
-    failure_counts,
+    exposure_figures,
+    failure_figures,
     hazard_counts,
-    positions,
     proof_margin_m,
     reasons_of,
-    service_levels,
+    service_level_columns,
     stanford_counts,
-    stanford_of_receiver,
+    stanford_counts_of_receiver,
     state_shares,
     time_in_use,
     verdict_of,
@@ -64,7 +64,7 @@ _WITHOUT_ODOMETER = (NotEvaluated.NO_ODOMETER, NotEvaluated.BEYOND_SPAN, NotEval
 
 
 def ingest_notes(ingest: IngestNotes) -> list[Remark]:
-    """What reading the log showed of it."""
+    """Notes on what reading the log showed."""
     corrected = [Remark(Note.CORRECTED, (made.stream, made.changes)) for made in ingest.corrections]
     return corrected + remarks(
         {
@@ -75,8 +75,8 @@ def ingest_notes(ingest: IngestNotes) -> list[Remark]:
     )
 
 
-def notes_of_replay(monitored: MonitoredSolution, evidence: TrainEvidence) -> list[Remark]:
-    """What went in, and what matching, alignment and the LDS made of it."""
+def replay_notes(monitored: MonitoredSolution, evidence: TrainEvidence) -> list[Remark]:
+    """Notes on the inputs, and on what matching, alignment and the LDS made of them."""
     prepared = monitored.prepared
     run = prepared.run
     counts = prepared.counts.solutions[monitored.solution.name]
@@ -84,18 +84,18 @@ def notes_of_replay(monitored: MonitoredSolution, evidence: TrainEvidence) -> li
     return remarks(
         {
             Note.FAULTS_INJECTED: "" if run.faults is None else ", ".join(sorted(set(run.faults["kind"]))),
-            Note.BALISES_OFF: _few(prepared.site.balises_off()),
+            Note.BALISES_OFF: _listed(prepared.site.balises_off()),
             Note.FAR_OFF: counts.far_off,
             Note.PLACEHOLDERS: counts.placeholders,
             Note.HELD: counts.held,
             Note.CONTRADICTING: counts.contradicting,
-            Note.SPANS_DIFFER: _spans_differ(run),
-            **_of_odometer(prepared.odometry, prepared.config.align.straight_s),
+            Note.SPANS_DIFFER: _span_differences_s(run),
+            **_odometer_notes(prepared.odometry, prepared.config.align.straight_s),
             Note.ODOMETER_REVERSED: monitored.match.odometer_sign < 0 and prepared.vehicle.gnss_antenna_ahead_m,
             Note.COVARIANCE: contradictory_covariances(monitored.solution.fixes),
             Note.AMBIGUOUS: ", ".join(say("ambiguity", "stretch", **row) for row in doubtful),
-            Note.OFF_NETWORK: _few([_off(row) for row in monitored.match.off.iter_rows(named=True)]),
-            Note.UNLINKED: _unlinked(monitored.lds.linking["link_distance"]),
+            Note.OFF_NETWORK: _listed([_off_network_words(row) for row in monitored.match.off.iter_rows(named=True)]),
+            Note.UNLINKED: _count_unlinked(monitored.lds.linking["link_distance"]),
             Note.UNKNOWN_TELEGRAMS: ", ".join(sorted(set(monitored.lds.unknown_reads["balise_id"]))),
             Note.READS_DISPUTED: evidence.disputed,
             Note.READS_UNREACHABLE: evidence.unreachable,
@@ -103,18 +103,19 @@ def notes_of_replay(monitored: MonitoredSolution, evidence: TrainEvidence) -> li
     )
 
 
-def _off(stretch: Mapping[str, Any]) -> str:
+def _off_network_words(stretch: Mapping[str, Any]) -> str:
     """One stretch off the network, with its place and how far aside."""
     side = "left" if stretch["offset_m"] > 0.0 else "right"
     return say("off_network", side, **{**stretch, "offset_m": abs(stretch["offset_m"])})
 
 
-def _few(names: list[str]) -> str:
+def _listed(names: list[str]) -> str:
+    """The first names of a list, and how many more there are."""
     more = f" and {len(names) - _NAMED} more" if len(names) > _NAMED else ""
     return ", ".join(names[:_NAMED]) + more
 
 
-def _spans_differ(run: RunLog) -> tuple[float, float] | None:
+def _span_differences_s(run: RunLog) -> tuple[float, float] | None:
     """By how much the odometer begins and ends after the GNSS [s], where that is more than a second."""
     if run.odometer is None:
         return None
@@ -123,8 +124,8 @@ def _spans_differ(run: RunLog) -> tuple[float, float] | None:
     return (begin_s, end_s) if max(abs(begin_s), abs(end_s)) > 1.0 else None
 
 
-def _of_odometer(odometry: Odometry | None, straight_s: float) -> dict[Note, object]:
-    """What the odometer's rows cannot tell."""
+def _odometer_notes(odometry: Odometry | None, straight_s: float) -> dict[Note, object]:
+    """Notes on what the odometer's rows cannot tell."""
     if odometry is None:
         return {}
     first = "".join(f"{datetime.fromtimestamp(t_ns // NS_PER_S, UTC):%H:%M:%S}" for t_ns in odometry.leaps_ns[:1])
@@ -134,15 +135,15 @@ def _of_odometer(odometry: Odometry | None, straight_s: float) -> dict[Note, obj
     }
 
 
-def _unlinked(distance: Verdicts) -> tuple[int, str] | None:
-    """How many positions after outages could not be re-linked, and why not."""
+def _count_unlinked(distance: Verdicts) -> tuple[int, str] | None:
+    """How many positions after outages could not be re-linked, and why not; None where all could."""
     counts = {reason.value: int((distance.reason == NUMBER[reason]).sum()) for reason in NO_RELINK}
     why = sorted(reason for reason, count in counts.items() if count)
     return (sum(counts.values()), ", ".join(why)) if why else None
 
 
-def judged_notes(run: Mapping[str, Any]) -> list[Remark]:
-    """What stands behind the judgements of a `runs` row (DOMAIN sections 5.1 and 5.4)."""
+def judgement_notes(run: Mapping[str, Any]) -> list[Remark]:
+    """Notes on what stands behind the judgements of a `runs` row (DOMAIN sections 5.1 and 5.4)."""
     evidence = run["evidence"]
     return remarks(
         {
@@ -157,7 +158,7 @@ def judged_notes(run: Mapping[str, Any]) -> list[Remark]:
 
 
 def undiagnosed_notes(epochs: JudgedEpochs, passages: pl.DataFrame) -> list[Remark]:
-    """Virtual balises that were accepted while no odometer could contradict the position."""
+    """Notes on virtual balises that were accepted while no odometer could contradict the position."""
     accepted = (pl.col("kind") == BaliseKind.VIRTUAL.value) & (pl.col("status") == PassageStatus.ACCEPTED.value)
     offers = passages.filter(accepted).drop_nulls("t_offered")
     # The first epoch at or after each offer.
@@ -167,9 +168,10 @@ def undiagnosed_notes(epochs: JudgedEpochs, passages: pl.DataFrame) -> list[Rema
     return [Remark(Note.UNDIAGNOSED, (count, reason.value)) for reason, count in counts.items() if count]
 
 
-def in_use_notes(epochs: JudgedEpochs, undetected: pl.DataFrame) -> list[Remark]:
-    """Epochs in use at which no figure bounds a fault still in use; `undetected`: columns of `epochs`, null where
-    nothing was computed.
+def unbounded_notes(epochs: JudgedEpochs, undetected: pl.DataFrame) -> list[Remark]:
+    """Notes on epochs in use at which no figure bounds a fault still in use.
+
+    `undetected`: columns of `epochs`, null where nothing was computed.
     """
     used = epochs.in_use & undetected["undetected_ahead_m"].is_not_null().to_numpy()
     unbounded = int((used & undetected["undetected_ahead_in_use_m"].is_null().to_numpy()).sum())
@@ -177,7 +179,7 @@ def in_use_notes(epochs: JudgedEpochs, undetected: pl.DataFrame) -> list[Remark]
 
 
 def time_notes(epochs: JudgedEpochs, clock: Clock, lost: LostTime, config: Configuration) -> list[Remark]:
-    """For how long nobody knows whether the train moved, and what the moving time without a valid TVB was lost to."""
+    """Notes on time of unknown movement, and on what the moving time without a valid TVB was lost to."""
     unknown_s = float(clock.held_s[epochs.may_move & ~epochs.moves].sum())
     low = lost.share is not None and 1.0 - lost.share < config.advice.low_availability
     return remarks(
@@ -231,39 +233,40 @@ def summarise(results: SolutionResults, config: Configuration, provenance: Prove
     judged = results.judged
     lost = lost_time(epochs, results.lost, judged.alarms, config)
     row = (
-        _identity(results)
+        _identity_columns(results)
         | _decisive(epochs, judged.passages, judged.failures, config)
         | ({} if judged.evidence else {"hazardous_s": None, "hazardous_natural_s": None})
         | lost.columns()
-        | _extent(epochs, clock, results.lost)
-        | positions(epochs, clock, config)
-        | accuracy(epochs)
+        | _extent_columns(epochs, clock, results.lost)
+        | availability_figures(epochs, clock, config)
+        | accuracy_figures(epochs)
         | hazard_counts(judged.hazards)
-        | alarm_counts(judged.alarms, epochs, judged.evidence)
-        | exposure(epochs)
+        | alarm_figures(judged.alarms, epochs, judged.evidence)
+        | exposure_figures(epochs)
         | state_shares(epochs)
         | stanford_counts(epochs, epochs.confidence_m, config.lds.ci_limit_m)
-        | stanford_of_receiver(epochs, config.lds.ci_limit_m)
-        | _provenance(provenance)
+        | stanford_counts_of_receiver(epochs, config.lds.ci_limit_m)
+        | _provenance_columns(provenance)
     )
-    row |= _part(results, row, config) | service_levels(row, config) | _verdict(row, config)
+    row |= _part_columns(results, row, config) | service_level_columns(row, config) | _verdict_columns(row, config)
     stated = bool(np.isfinite(epochs.survey_sigma_m).any())
     clock_open_m = results.clock_open_s * float(np.abs(np.nan_to_num(epochs.speed_mps)).max(initial=0.0))
-    cures = remedies(row, lost, in_use_of(epochs, float(results.lost.moving_s.sum())), stated, config, clock_open_m)
+    cures = remedies(row, lost, moving_in_use(epochs, float(results.lost.moving_s.sum())), stated, config, clock_open_m)
     noted = (
         *ingest_notes(results.ingest),
         *results.notes,
-        *judged_notes(row),
+        *judgement_notes(row),
         *undiagnosed_notes(epochs, judged.passages),
-        *in_use_notes(epochs, results.undetected),
+        *unbounded_notes(epochs, results.undetected),
         *time_notes(epochs, clock, lost, config),
         *(Remark(Note.REMEDY, (remedy_words(cure, gain),)) for cure, gain in cures.items()),
     )
     advice = {"remedies": list(cures), "remedies_gain": list(cures.values())}
-    return _frame(row | advice | {"notes": notes_text(noted)})
+    return _row_as_table(row | advice | {"notes": notes_text(noted)})
 
 
-def _identity(results: SolutionResults) -> Row:
+def _identity_columns(results: SolutionResults) -> Row:
+    """Columns of which solution it is, its status, evidence and distance."""
     ingest = results.ingest
     damaged = ingest.partial_until_ns is not None or ingest.damage is not None
     return {
@@ -279,22 +282,23 @@ def _identity(results: SolutionResults) -> Row:
 
 
 def _decisive(epochs: JudgedEpochs, passages: pl.DataFrame, failures: Sequence[Failure], config: Configuration) -> Row:
-    """What decides the verdict of a run, or of a part of it (`reasons_of`)."""
+    """The columns that decide the verdict of a run, or of a part of it (`reasons_of`)."""
     return {
         **time_in_use(epochs, config.lds.recovery_s),
         **balise_counts(passages),
-        **failure_counts(failures),
+        **failure_figures(failures),
         "proof_margin_m": proof_margin_m(epochs, passages, config.hazards.limits.failure_m),
     }
 
 
-def _verdict(row: Row, config: Configuration) -> Row:
+def _verdict_columns(row: Row, config: Configuration) -> Row:
+    """Columns of verdict and reasons."""
     reasons = reasons_of(row, config.budget_s, config.hazards)
     return {"verdict": verdict_of(reasons), "reasons": reasons}
 
 
-def _part(results: SolutionResults, row: Row, config: Configuration) -> Row:
-    """The verdict of the part from the first to the last anchor, where the run goes on beyond it."""
+def _part_columns(results: SolutionResults, row: Row, config: Configuration) -> Row:
+    """Columns of the verdict from the first to the last anchor, where the run goes on beyond them."""
     if results.anchored_ns is None:
         return {}
     from_ns, to_ns = results.anchored_ns
@@ -309,8 +313,8 @@ def _part(results: SolutionResults, row: Row, config: Configuration) -> Row:
     of_part = (results.judged.offers.epoch >= rows[0]) & (results.judged.offers.epoch <= rows[-1])
     offers = results.judged.offers.where(np.flatnonzero(of_part))
     passages = results.judged.passages.filter(pl.col("crossing_id").is_in(offers.crossing_id.tolist()))
-    decisive = _decisive(part, passages, failures_within(part, offers, config), config)
-    verdict = _verdict(row | decisive | {"duration_s": (to_ns - from_ns) / NS_PER_S}, config)["verdict"]
+    decisive = _decisive(part, passages, failures_of_part(part, offers, config), config)
+    verdict = _verdict_columns(row | decisive | {"duration_s": (to_ns - from_ns) / NS_PER_S}, config)["verdict"]
     return {"part_verdict": verdict, "part_from": from_ns, "part_to": to_ns, "part_share": share}
 
 
@@ -318,10 +322,12 @@ def failed_row(error: str, provenance: Provenance, solution: str = "") -> pl.Dat
     """The `runs` row of a run that could not be replayed: counts are zero, the rest is not known."""
     columns = Runs.columns().items()
     zeros: Row = {name: 0 for name, column in columns if column.dtype == pl.Int64 and not column.nullable}
-    return _frame(zeros | {"solution": solution, "status": RunStatus.FAILED, "error": error} | _provenance(provenance))
+    return _row_as_table(
+        zeros | {"solution": solution, "status": RunStatus.FAILED, "error": error} | _provenance_columns(provenance)
+    )
 
 
-def _frame(row: Mapping[str, object]) -> pl.DataFrame:
+def _row_as_table(row: Mapping[str, object]) -> pl.DataFrame:
     """The row as a table, where nothing is NaN or infinite."""
     schema = dtypes(Runs)
     unknown = {name for name, value in row.items() if isinstance(value, float) and not math.isfinite(value)}
@@ -330,7 +336,8 @@ def _frame(row: Mapping[str, object]) -> pl.DataFrame:
     return pl.DataFrame([values], schema=schema)
 
 
-def _extent(epochs: JudgedEpochs, clock: Clock, lost: LostColumns) -> Row:
+def _extent_columns(epochs: JudgedEpochs, clock: Clock, lost: LostColumns) -> Row:
+    """Columns of begin, end, duration, moving time and epochs."""
     begin_ns, end_ns = epochs.t_ns[[0, -1]].tolist() if epochs.height else (None, None)
     return {
         "t_start": begin_ns,
@@ -342,6 +349,7 @@ def _extent(epochs: JudgedEpochs, clock: Clock, lost: LostColumns) -> Row:
     }
 
 
-def _provenance(provenance: Provenance) -> Row:
+def _provenance_columns(provenance: Provenance) -> Row:
+    """Columns of the inputs, settings and software."""
     calibrated_by = list(provenance.calibrated_by)
     return {**vars(provenance), "calibrated_by": calibrated_by, "contract": CONTRACT_VERSION}

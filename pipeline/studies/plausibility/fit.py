@@ -12,7 +12,7 @@ import numpy as np
 import polars as pl
 
 from pipeline.stages.clean.clean import CleanCounts, clean, require_one_journey
-from pipeline.stages.judge.epochs import under_injection
+from pipeline.stages.judge.epochs import injected_at
 from pipeline.stages.judge.judged import JudgedEpochs
 from pipeline.stages.prepare import PreparedRun
 from pipeline.studies.plausibility.check import Cause, Check, FitState, explain_accuracy, not_checked
@@ -310,7 +310,7 @@ def accuracy_checks(epochs: JudgedEpochs, faults: pl.DataFrame | None, config: C
 
     Epochs under an injected fault, or negated, are left out: their errors are not the receiver's.
     """
-    counted = ~under_injection(epochs.t_ns, faults, config.lds.recovery_s) & ~epochs.negated
+    counted = ~injected_at(epochs.t_ns, faults, config.lds.recovery_s) & ~epochs.negated
     stated_m = {"sigma": epochs.sigma_along_m, "hpl": epochs.hpl_m / config.lds.ci_factor}
     return [check for what, sigma_m in stated_m.items() for check in _check(what, sigma_m, epochs, counted, config)]
 

@@ -9,7 +9,7 @@ import math
 
 import polars as pl
 
-from pipeline.stages.run_row.bounds import continuity
+from pipeline.stages.run_row.bounds import continuity_over
 from pipeline.studies.safety.budget import S_PER_H, Figure, each, levels_table
 from pipeline.studies.safety.markov import lds_hazard_rate_per_h
 from schemas.config import SafetyConfig
@@ -126,14 +126,19 @@ def continuity_table() -> pl.DataFrame:
     single_h = mtbf_h(APV_CONTINUITY_RISK, APV_INTERVAL_S)
     composite_h = mtbf_two_of_two_h(single_h)
     rows = [
-        ("1oo1, reactive", single_h, continuity(APV_INTERVAL_S, single_h), "LOC eq. 8 and 10"),
+        ("1oo1, reactive", single_h, continuity_over(APV_INTERVAL_S, single_h), "LOC eq. 8 and 10"),
         (
             "1oo2, reactive",
             mtbf_one_of_two_h(single_h),
             continuity_one_of_two(APV_INTERVAL_S, single_h),
             "MTBF LOC eq. 11, t = 1 h; continuity ours: both channels fail within the same 15 s",
         ),
-        ("2oo2, composite", composite_h, continuity(APV_INTERVAL_S, composite_h), "ours: both channels are needed"),
+        (
+            "2oo2, composite",
+            composite_h,
+            continuity_over(APV_INTERVAL_S, composite_h),
+            "ours: both channels are needed",
+        ),
     ]
     table = pl.DataFrame(rows, schema=["architecture", "mtbf_h", "continuity_15s", "source"], orient="row")
     return table.with_columns(

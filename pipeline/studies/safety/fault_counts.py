@@ -6,9 +6,9 @@ import numpy as np
 import polars as pl
 
 from pipeline.stages.epochs.verdicts import AlarmEpisode, FailureLog
-from pipeline.stages.judge.episodes import verdict_within
-from pipeline.stages.judge.judgement import margins_m
-from pipeline.stages.run_row.bounds import missed_detection, since_when_at_most
+from pipeline.stages.judge.episodes import verdict_of_intervals
+from pipeline.stages.judge.judgement import healthy_margins_m
+from pipeline.stages.run_row.bounds import earliest_failure, missed_detection
 from schemas.arrays import NS_PER_S, floats
 from schemas.config import HazardConfig
 from schemas.enums import Verdict
@@ -28,7 +28,7 @@ def faults_of_pair(first: pl.DataFrame, second: pl.DataFrame) -> pl.DataFrame:
     apart = begin_ns > end_ns.cum_max().shift(1)
     return both.group_by(fault=apart.fill_null(value=False).cum_sum(), maintain_order=True).agg(
         pl.col("begin", "t_failure").min(),
-        t_failure_may=since_when_at_most(),
+        t_failure_may=earliest_failure(),
         t_end=pl.when(pl.col("t_end").null_count() == 0).then(pl.col("t_end").max()),
         budget_s=pl.col("budget_s").min(),
         failed=pl.col("failed").any(),
@@ -117,7 +117,9 @@ def _of_side(alarm: AlarmEpisode, side: SolutionTables, config: HazardConfig) ->
     low_m, high_m, sigma_m = (floats(known, name) for name in ("error_low_m", "error_high_m", "sigma_along_m"))
     if _known_wrong(alarm, side):
         return Verdict.TRUE
-    return verdict_within(low_m, high_m, margins_m(sigma_m, config), np.full(known.height, side.with_truth))
+    return verdict_of_intervals(
+        low_m, high_m, healthy_margins_m(sigma_m, config), np.full(known.height, side.with_truth)
+    )
 
 
 def _known_wrong(alarm: AlarmEpisode, side: SolutionTables) -> bool:

@@ -15,7 +15,7 @@ import polars as pl
 
 from pipeline.results import store
 from pipeline.results.figures.head import head_of, run_verdicts
-from pipeline.stages.run_row.run_figures import failures_in, level_counts, reasons_of, verdict_of
+from pipeline.stages.run_row.run_figures import count_kept_and_exceeded, failures_of_run, reasons_of, verdict_of
 from schemas.config import Configuration
 from schemas.enums import RunStatus
 
@@ -59,7 +59,7 @@ def _with_allowed(row: Row, allowed_s: float, config: Configuration) -> Row:
     """A `runs` row with the failures, reasons and verdict of another allowed time."""
     if row["status"] == RunStatus.FAILED:
         return row
-    within, beyond = level_counts(failures_in(row), allowed_s)
+    within, beyond = count_kept_and_exceeded(failures_of_run(row), allowed_s)
     counted = {**row, "failures_within_budget": within, "failures_beyond_budget": beyond}
     reasons = reasons_of(counted, allowed_s, config.hazards)
     return {**counted, "reasons": reasons, "verdict": verdict_of(reasons).value}

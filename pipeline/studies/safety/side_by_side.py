@@ -16,7 +16,7 @@ from pipeline.stages.epochs.clock import Clock, held_s, holds, may_move, nominal
 from pipeline.stages.epochs.verdicts import FailureLog, Verdicts, failure_log
 from pipeline.stages.monitors.single import channel_monitor, on_path_of, paired
 from pipeline.stages.run_row.bounds import independent_episodes
-from pipeline.stages.run_row.run_figures import judged as judged_epoch
+from pipeline.stages.run_row.run_figures import is_judged as judged_epoch
 from pipeline.studies.safety.fault_counts import SolutionTables, fault_counts, faults_of_pair, verdict_of_both
 from pipeline.studies.safety.tally import COMPOSITE, COUNTS, REACTIVE, REDUNDANT
 from schemas.arrays import NS_PER_S, Bools

@@ -6,7 +6,13 @@ from collections.abc import Iterable, Mapping
 
 import polars as pl
 
-from pipeline.stages.run_row.bounds import clopper_pearson, continuity_15s, mtbf, poisson_rate, with_estimates
+from pipeline.stages.run_row.bounds import (
+    clopper_pearson,
+    continuity_estimate,
+    mtbf_estimate,
+    poisson_rate,
+    with_estimates,
+)
 
 REACTIVE = "reactive 1oo1"
 COMPOSITE = "composite 2oo2"
@@ -63,8 +69,8 @@ def architecture_figures(counts: pl.DataFrame) -> pl.DataFrame:
         table,
         ("missed_share", "", clopper_pearson, "missed_judged", "failures_judged"),
         ("false_alarm_rate", "_per_h", poisson_rate, "false_where_all_known", "judged_h"),
-        ("mtbf", "_h", mtbf, "losses", "up_h"),
-        ("continuity_15s", "", continuity_15s, "losses", "up_h"),
+        ("mtbf", "_h", mtbf_estimate, "losses", "up_h"),
+        ("continuity_15s", "", continuity_estimate, "losses", "up_h"),
     )
     ordered = table.sort(pl.col("architecture").replace_strict(order, return_dtype=pl.Int64), "solution", "other")
     return ordered.select(*_KEYS, *(name for name in ("runs",) if name in counts.columns), *_SHOWN)

@@ -25,7 +25,7 @@ from pipeline.read.ingest.layout import LayoutDecoder, UndecodableError, constan
 from pipeline.read.ingest.mcap_records import Channel
 from pipeline.read.ingest.protobuf import layout_by
 from pipeline.read.ingest.ros_message import DefinitionError, Member, RosWalk, parse_definitions
-from pipeline.stages.clean.clean import clean, of_the_journey
+from pipeline.stages.clean.clean import clean, without_undated_streams
 from pipeline.storage.parquet import parquet_bytes
 from schemas.config import IngestConfig, StreamCorrection
 from schemas.errors import InputError
@@ -385,10 +385,10 @@ def test_a_stream_all_of_another_day_is_seen_by_the_fit_only() -> None:
     found, _ = clean(run.with_streams(balise_reads=reads))
     assert found.balise_reads is not None
     assert found.balise_reads.height == 2
-    judged = of_the_journey(found)
+    judged = without_undated_streams(found)
     assert judged.balise_reads is None
     assert "more than a day from the positions" in judged.notes.skipped_topics[-1]
-    assert of_the_journey(run) is run
+    assert without_undated_streams(run) is run
 
 
 def test_parquet_without_checksums_is_said_and_with_them_is_proved(tmp_path: Path) -> None:

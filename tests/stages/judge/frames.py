@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import polars as pl
 
-from pipeline.stages.judge.failures import ErrorHistory, Jump, history_of
+from pipeline.stages.judge.failures import ErrorHistory, Jump, history_of_positions
 from pipeline.stages.judge.judged import JudgedEpochs, JudgedOffers
 from schemas.config import Configuration
 from schemas.enums import Evidence, Judgement
@@ -68,7 +68,7 @@ def offers(epochs: Sequence[int], **columns: Any) -> JudgedOffers:
 
 
 def history(positioned: JudgedEpochs, *jumps: Jump, offered: JudgedOffers | None = None) -> ErrorHistory:
-    return history_of(positioned, offers([]) if offered is None else offered, jumps, CONFIG)
+    return history_of_positions(positioned, offers([]) if offered is None else offered, jumps, CONFIG)
 
 
 _KINDS: dict[str, pl.DataType] = {

@@ -16,27 +16,27 @@ from pipeline.stages.judge.episodes import (
     Detection,
     Episode,
     Extent,
-    _belongs,
-    _failed,
-    _failed_may_ns,
-    _is_back,
+    _earliest_failure_ns,
+    _failure_begin,
+    _is_alarm_of,
+    _leads_back,
+    alarm_verdict,
     find_episodes,
-    healthy_across,
-    named_onset_ns,
-    suspect_of,
-    verdict_of,
-    verdict_within,
+    injected_onset_ns,
+    suspected_source,
+    verdict_of_intervals,
+    within_noise_across,
 )
 from pipeline.stages.judge.epochs import (
     OdometerSteps,
     TimeInUse,
-    beyond_confidence,
-    cross_errors,
+    cross_errors_m,
+    exceeds_odometer_confidence,
+    injected_at,
     lds_states,
-    moving,
+    moves_and_may_move,
     time_in_use,
     travel_direction,
-    under_injection,
 )
 from pipeline.stages.judge.failures import (
     ErrorHistory,
@@ -44,26 +44,34 @@ from pipeline.stages.judge.failures import (
     Jump,
     find_failures,
     find_jumps,
-    steps_of,
-    within_budget,
+    keeps_budget,
+    position_changes,
 )
-from pipeline.stages.judge.hazards import HazardRow, _evidence, crossed_by, hazard_rows, instants, rate_mps, size_m
+from pipeline.stages.judge.hazards import (
+    HazardRow,
+    _evidence_of_row,
+    crossed_by_jump,
+    error_growth_mps,
+    hazard_rows,
+    hazard_size_m,
+    instant_columns,
+)
 from pipeline.stages.judge.judge import (
     TrueCrossing,
-    _true_times,
-    _within_gap,
-    between_far_epochs,
-    failures_of,
+    _is_interpolated,
+    _take_true_times,
+    failure_columns,
     true_crossings,
+    with_instants_between,
 )
 from pipeline.stages.judge.judged import RIGHT, UNKNOWN, WRONG, Judgements
 from pipeline.stages.judge.judgement import (
     JudgeInput,
     MatchedPositions,
     Solution,
+    healthy_margins_m,
+    judge_by_own_anchors,
     judge_positions,
-    margins_m,
-    with_own_anchors,
 )
 from pipeline.stages.track.path import Place, RoutePath
 from schemas.config import Configuration, HazardConfig, LdsConfig, Vehicle
@@ -114,21 +122,21 @@ def test_a_budget_is_kept_where_nothing_wrong_was_accepted_in_the_failure(
     """From the third of eight positions on."""
     offered = offers([epoch], judgement=judged, accepted=accepted)
     worst = history(positions(range(8)), offered=offered).worst_accepted(2, 8)
-    assert within_budget(0.2, may_s, worst, 0.5) is kept
+    assert keeps_budget(0.2, may_s, worst, 0.5) is kept
 
 
 def test_the_distance_counts_from_the_last_accepted_balise() -> None:
     """The odometer misses 30 m between 1 s and 2 s; a balise accepted at 3 s is a new begin."""
     t_ns, odometer_m = seconds(0, 1, 2, 3, 4), np.linspace(0.0, 40.0, 5)
     train_m = odometer_m + np.array([0.0, 0.0, 30.0, 30.0, 30.0])
-    beyond = beyond_confidence(t_ns, odometer_m, train_m, np.zeros(5), seconds(1, 3), LdsConfig())
+    beyond = exceeds_odometer_confidence(t_ns, odometer_m, train_m, np.zeros(5), seconds(1, 3), LdsConfig())
     assert beyond.tolist() == [False, False, True, False, False]
 
 
 @pytest.mark.parametrize(("detected_ns", "until_ns"), [(None, 30), (20, 20)])
 def test_a_fault_is_undetected_until_a_monitor_fails_or_to_its_end(detected_ns: int | None, until_ns: int) -> None:
     episode = replace(EPISODE, begin_ns=1, end_ns=30, detection=Detection(detected_ns))
-    assert episode.undetected_ns == (1, until_ns)
+    assert episode.undetected_span_ns == (1, until_ns)
 
 
 def test_what_a_step_offers_on_its_way_lies_before_its_first_position() -> None:
@@ -154,7 +162,7 @@ def test_an_alarm_is_false_only_where_all_of_its_positions_were_well(
     low_m: list[float], high_m: list[float], told: list[bool], verdict: Verdict
 ) -> None:
     margin_m = np.full(len(told), 5.0)
-    assert verdict_within(np.array(low_m), np.array(high_m), margin_m, np.array(told, dtype=bool)) is verdict
+    assert verdict_of_intervals(np.array(low_m), np.array(high_m), margin_m, np.array(told, dtype=bool)) is verdict
 
 
 def errors_across(fixes: pl.DataFrame, heading_deg: Any, at_s: list[float], reference: pl.DataFrame) -> list[Any]:
@@ -163,7 +171,7 @@ def errors_across(fixes: pl.DataFrame, heading_deg: Any, at_s: list[float], refe
     epochs = arrays_of_table(MonitoredEpochs, stamps)
     solution = Solution("primary", fixes, epochs, absent, absent, absent, absent)
     given = JudgeInput(solution, absent, None, Vehicle(), Configuration(), reference)
-    return list(cross_errors(given, heading_deg))
+    return list(cross_errors_m(given, heading_deg))
 
 
 def test_errors_across_are_left_of_growing_path_and_upwards() -> None:
@@ -259,7 +267,7 @@ def test_an_alarm_shortly_before_a_drift_is_its_onset_and_was_there_before_it(
 
 def test_the_margin_of_a_healthy_position() -> None:
     """max(5 m, min(3 sigma, 20 m)); 20 m where no sigma is known."""
-    assert margins_m(np.array([0.5, 3.0, 20.0, np.nan]), HazardConfig()).tolist() == [5.0, 9.0, 20.0, 20.0]
+    assert healthy_margins_m(np.array([0.5, 3.0, 20.0, np.nan]), HazardConfig()).tolist() == [5.0, 9.0, 20.0, 20.0]
 
 
 def test_what_an_episode_hit() -> None:
@@ -291,12 +299,12 @@ def test_what_an_episode_hit() -> None:
 def test_a_jump_back_leads_to_a_place_that_is_not_wrong(
     before_m: float, step_m: float, after_m: float, code: int, back: bool
 ) -> None:
-    middle_m, size_m = np.array([before_m, 0.0]), np.array([0.0, after_m])
-    low_m = np.where(np.arange(2) == 0, middle_m, size_m)
+    middle_m, hazard_size_m = np.array([before_m, 0.0]), np.array([0.0, after_m])
+    low_m = np.where(np.arange(2) == 0, middle_m, hazard_size_m)
     kind, track = np.zeros(2, dtype=np.int64), np.zeros(2, dtype=bool)
     judged = Judgements(np.array([WRONG, code]), low_m, low_m, kind, track, np.zeros(2, dtype=bool))
     of_judged = history(replace(positions(range(2)), judgements=judged))
-    assert bool(_is_back(of_judged, Jump(1, 1, step_m))) is back
+    assert bool(_leads_back(of_judged, Jump(1, 1, step_m))) is back
 
 
 @pytest.mark.parametrize(("may_s", "detected_s"), [(104.5, 107.0), (None, 107.0), (104.5, None)])
@@ -306,7 +314,7 @@ def test_the_times_of_a_hazard(may_s: float | None, detected_s: float | None) ->
     episode = replace(
         EPISODE, onset_ns=103 * NS, end_ns=109 * NS, failed=5, may_ns=ns(may_s), detection=Detection(ns(detected_s))
     )
-    found = instants(HazardRow(Hazard.VB_SHIFT, episode, None, [1]), met)
+    found = instant_columns(HazardRow(Hazard.VB_SHIFT, episode, None, [1]), met)
     times = [found[name] for name in ("t_onset", "t_hazard", "t_failure", "t_end")]
     assert times == seconds(103, 104, 105, 109).tolist()
     seen = detected_s is not None
@@ -336,10 +344,10 @@ def test_who_is_suspected(
         range(10), np.where(told, error_m, 0.0), 0.0, evidence=kind.value, odometer_stood=told & stood,
         odometer_wrong=told & counted_wrong, gate_probability=np.where(~told | sure, 1.0, 0.5),
     )  # fmt: skip
-    assert suspect_of(epochs, 6 * NS, 6 * NS, Configuration()) is suspect
+    assert suspected_source(epochs, 6 * NS, 6 * NS, Configuration()) is suspect
     # What was before the time looked back on does not count.
     late = 70 * NS
-    assert suspect_of(epochs, 6 * NS + late, 6 * NS + late, Configuration()) is Suspect.UNKNOWN
+    assert suspected_source(epochs, 6 * NS + late, 6 * NS + late, Configuration()) is Suspect.UNKNOWN
 
 
 @pytest.mark.parametrize(
@@ -357,7 +365,7 @@ def test_a_failure_is_a_second_of_wrong_from_the_onset_on(
     """Positions each 0.5 s, the onset is the third."""
     frame = positions(0.5 * np.arange(8), [30.0 if k in wrong else 0.0 for k in range(8)])
     jump = None if step is None else Jump(*step, 30.0)
-    assert _failed(history(frame), Extent(2, 2, 8, jump, None)) == failure
+    assert _failure_begin(history(frame), Extent(2, 2, 8, jump, None)) == failure
 
 
 @pytest.mark.parametrize(
@@ -374,7 +382,7 @@ def test_since_when_a_drift_may_have_failed(
 ) -> None:
     """6 m more each second, known to 5 m: beyond 20 m for certain at 5 s, and possibly from 3 s on."""
     frame = positions(range(6), 6.0 * np.arange(6), 5.0, judgement=judgement, evidence=evidence)
-    assert _failed_may_ns(history(frame), 5) == ns(may_s)
+    assert _earliest_failure_ns(history(frame), 5) == ns(may_s)
 
 
 def placed(path_m: list[float], element: int = 0) -> MatchedPositions:
@@ -406,7 +414,7 @@ def test_the_odometer_since_a_balise_shows_only_what_was_wrong() -> None:
     unknown = np.full(6, np.nan)
     judged = Judgements(np.full(6, UNKNOWN), unknown, unknown, before, *np.zeros((2, 6), dtype=bool))
     low_m = np.array([90.0, 90.0, 90.0, 90.0, np.nan, 100.0])
-    found = with_own_anchors(judged, given, (low_m, low_m + 10.0), HazardConfig())
+    found = judge_by_own_anchors(judged, given, (low_m, low_m + 10.0), HazardConfig())
     assert found.code.tolist() == [UNKNOWN, WRONG, UNKNOWN, UNKNOWN, UNKNOWN, WRONG]
     odometer = KINDS.index(Evidence.ODOMETER)
     assert found.kind.tolist() == [odometer, odometer, balise, nothing, nothing, odometer]
@@ -477,9 +485,9 @@ def test_only_an_injected_fault_of_gnss_is_not_natures(target: str, end_s: float
     stamps = [pl.Series([None if t is None else ns(t)], dtype=pl.Int64) for t in (20.0, end_s)]
     begin, end = (stamp.cast(pl.Datetime("ns", "UTC")) for stamp in stamps)
     faults = pl.DataFrame({"t_start": begin, "t_end": end, "target": [target]})
-    found = under_injection(seconds(*range(0, 90, 10)), faults, recovery_s=30.0).tolist()
+    found = injected_at(seconds(*range(0, 90, 10)), faults, recovery_s=30.0).tolist()
     assert found == [letter == "+" for letter in under]
-    assert not under_injection(seconds(20.0), None, 30.0).any()
+    assert not injected_at(seconds(20.0), None, 30.0).any()
 
 
 def test_a_withheld_position_is_not_in_use_nor_what_follows_upon_its_alarm() -> None:
@@ -523,7 +531,9 @@ def test_a_train_moves_farther_in_a_second_than_the_noise_of_its_places() -> Non
     moves = np.array([True] * 8 + [False] * 2)
     counted = np.array([False] * 6 + [True] * 3 + [False])
     odometer, stood = OdometerSteps(moves, counted), np.arange(10) == 7
-    moves, may_move = moving(seconds(*(0.5 * np.arange(10))), at_m, np.full(10, 0.1), odometer, stood, Configuration())
+    moves, may_move = moves_and_may_move(
+        seconds(*(0.5 * np.arange(10))), at_m, np.full(10, 0.1), odometer, stood, Configuration()
+    )
     # By the reference up to 1.5 s, as far as it goes; then by the odometer from 3 s on, but for what it stood.
     known = [None if may and not moved else bool(moved) for moved, may in zip(moves, may_move, strict=True)]
     assert known == [False, True, True, True, None, None, True, None, False, False]
@@ -577,8 +587,8 @@ def test_what_an_interval_of_errors_says() -> None:
     assert judged.half_m.tolist() == [5.0, 1.0, 2.0]
     assert judged.least_m.tolist() == [0.0, 2.0, 5.0]
     assert judged.largest_m.tolist() == [6.0, 4.0, 9.0]
-    assert judged.known_m(4.9) == pytest.approx([np.nan, 3.0, np.nan], nan_ok=True)
-    assert judged.known_m(5.0) == pytest.approx([1.0, 3.0, np.nan], nan_ok=True)
+    assert judged.known_error_m(4.9) == pytest.approx([np.nan, 3.0, np.nan], nan_ok=True)
+    assert judged.known_error_m(5.0) == pytest.approx([1.0, 3.0, np.nan], nan_ok=True)
 
 
 @pytest.mark.parametrize(("onward", "code"), [([0], RIGHT), ([0, 2], WRONG), ([0, 1], RIGHT)])
@@ -618,7 +628,7 @@ def test_a_jump_is_what_gathers_within_a_second(
     train_m, t_ns = 10.0 * np.arange(10), seconds(*(0.5 * np.arange(10)))
     unknown = np.full(10, np.nan)
     told = (unknown, np.full(9, 10.0)) if by_odometer else (train_m, unknown[:9])
-    steps = steps_of(t_ns, train_m + error_m, *told, np.full(10, round(gap_s * NS)))
+    steps = position_changes(t_ns, train_m + error_m, *told, np.full(10, round(gap_s * NS)))
     found = find_jumps(steps, np.full(10, direction), HazardConfig())
     assert [(one.first, one.last, one.step_m) for one in found] == jumps
 
@@ -629,7 +639,7 @@ def test_a_jump_crosses_what_the_train_itself_did_not(train_m: float, crossed: l
     path_m, virtual = [99.0, 125.0, 135.0, 111.0, 138.0, 145.0], [True, True, True, True, False, True]
     offered = offers([2, 3, 3, 3, 3, 4], path_m=path_m, virtual=virtual)
     at = positions(range(5), path_m=[80.0, 90.0, 100.0, 140.0, 150.0], train_m=np.full(5, train_m))
-    assert crossed_by(Jump(3, 3, 30.0), history(at, offered=offered)) == crossed
+    assert crossed_by_jump(Jump(3, 3, 30.0), history(at, offered=offered)) == crossed
 
 
 @pytest.mark.parametrize(
@@ -653,15 +663,15 @@ def test_the_onset_is_that_of_a_fault_of_the_positions_that_lasted(
             "target": ["position", "along", "odometer", "G08"],
         }
     ).with_columns(pl.col("t_start", "t_end").cast(pl.Datetime("ns", "UTC")))
-    found = named_onset_ns(faults, onset_s * NS, mark_s * NS)
+    found = injected_onset_ns(faults, onset_s * NS, mark_s * NS)
     assert found == (None if named_s is None else named_s * NS)
-    assert named_onset_ns(faults.clear(), onset_s * NS, mark_s * NS) is None
-    assert named_onset_ns(None, onset_s * NS, mark_s * NS) is None
+    assert injected_onset_ns(faults.clear(), onset_s * NS, mark_s * NS) is None
+    assert injected_onset_ns(None, onset_s * NS, mark_s * NS) is None
 
 
 def test_evidence_is_looked_at_between_positions_that_are_far_apart() -> None:
     """A look each second at least; a step of 1.5 s is none to fill."""
-    found = between_far_epochs(seconds(0, 0.5, 2.0, 5.0, 6.0), 1.0)
+    found = with_instants_between(seconds(0, 0.5, 2.0, 5.0, 6.0), 1.0)
     assert (found / NS).tolist() == [0.0, 0.5, 2.0, 3.0, 4.0, 5.0, 6.0]
 
 
@@ -683,8 +693,8 @@ def test_the_size_and_slope_of_a_hazard(
     drift = history(positions(range(12), -2.5 * np.arange(12.0) + 2.5, half_m), offered=offered)
     episode = replace(EPISODE, onset=2, end=12, mark=10, failed=3, onset_ns=2 * NS, jump_back=jump if back else None)
     row = HazardRow(Hazard.VB_SHIFT, episode, jump, [0])
-    assert size_m(row, drift) == pytest.approx(size)
-    found = rate_mps(row, drift)
+    assert hazard_size_m(row, drift) == pytest.approx(size)
+    found = error_growth_mps(row, drift)
     assert found == (None if rate is None else pytest.approx(rate))
 
 
@@ -694,7 +704,7 @@ def test_a_hazard_rests_on_what_judged_its_first_balise_else_on_its_first_positi
 ) -> None:
     offered = offers([2, 3], evidence=[first, "odometer"])
     met = history(positions(range(5), evidence=["balise", *["odometer"] * 4]), offered=offered)
-    assert _evidence(HazardRow(Hazard.VB_SHIFT, EPISODE, None, [0, 1]), met) is kind
+    assert _evidence_of_row(HazardRow(Hazard.VB_SHIFT, EPISODE, None, [0, 1]), met) is kind
 
 
 def test_pulses_are_one_failure_and_a_calm_half_minute_ends_it() -> None:
@@ -739,7 +749,7 @@ def test_each_crossing_of_the_train_belongs_to_one_passage() -> None:
         name: [TrueCrossing(round(t * NS), 1, True) for t in passed]
         for name, passed in {"V1": [12.2], "V2": [20.0, 29.0], "V3": [40.0, 41.0], "V4": []}.items()
     }
-    found = _true_times(passages, crossings)
+    found = _take_true_times(passages, crossings)
     assert found.to_list() == [None, ns(12.2), ns(29.0), ns(40.0), None]
     assert {name: [round(left.t_ns / NS) for left in several] for name, several in crossings.items()} == {
         "V1": [], "V2": [20], "V3": [41], "V4": [],
@@ -753,8 +763,8 @@ def test_each_crossing_of_the_train_belongs_to_one_passage() -> None:
 def test_a_crossing_is_positioned_between_two_positions_near_each_other(t_s: float, positioned: bool) -> None:
     """Positions each second, but none between 2 s and 6 s."""
     at_ns = np.array([0, 1, 2, 6, 7]) * NS
-    assert _within_gap(at_ns, np.array([ns(t_s)]), LdsConfig()).tolist() == [positioned]
-    assert _within_gap(at_ns[:1], np.array([0]), round(1.5 * NS)).tolist() == [False]
+    assert _is_interpolated(at_ns, np.array([ns(t_s)]), LdsConfig()).tolist() == [positioned]
+    assert _is_interpolated(at_ns[:1], np.array([0]), round(1.5 * NS)).tolist() == [False]
 
 
 PASSAGES = [
@@ -778,7 +788,7 @@ def test_failure_mode_and_cause_of_a_passage() -> None:
         t_offered=pl.when("offered").then(pl.lit(0)),
         window_close_m=pl.lit(200.0),
     )
-    modes, causes = failures_of(frame, frame["_inserted"].to_numpy(), frame["_positioned"].to_numpy())
+    modes, causes = failure_columns(frame, frame["_inserted"].to_numpy(), frame["_positioned"].to_numpy())
     assert modes.to_list() == frame["mode"].to_list()
     assert causes.to_list() == frame["why"].to_list()
 
@@ -804,10 +814,10 @@ def test_whether_an_alarm_was_due(error_m: float, half_m: float, evidence: str, 
     epochs = positions(range(10), error, half_m, evidence=evidence, error_cross_m=across, error_up_m=across, **sigmas)
     alarm = AlarmEpisode(5, 5, 5 * NS, 5 * NS, (monitor,), 2.0)
     config = HazardConfig()
-    assert verdict_of(alarm, epochs, healthy_across(epochs, config), config) is verdict
+    assert alarm_verdict(alarm, epochs, within_noise_across(epochs, config), config) is verdict
     # What comes after the alarm says nothing of it.
     early = AlarmEpisode(2, 2, 2 * NS, 2 * NS, (monitor,), 2.0)
-    assert verdict_of(early, epochs, healthy_across(epochs, config), config) is not Verdict.TRUE
+    assert alarm_verdict(early, epochs, within_noise_across(epochs, config), config) is not Verdict.TRUE
 
 
 @pytest.mark.parametrize(
@@ -830,7 +840,7 @@ def test_an_alarm_belongs_to_the_fault_that_lasted_or_that_it_showed(
     """An alarm from 5 s to 8 s."""
     alarm = AlarmEpisode(5, 8, 5 * NS, 8 * NS, ("along_raw",), 2.0)
     episode = replace(EPISODE, onset_ns=onset_s * NS, end_ns=end_s * NS, detection=Detection(ns(detected_s)))
-    assert _belongs(alarm, episode) is belongs
+    assert _is_alarm_of(alarm, episode) is belongs
 
 
 def test_what_was_offered_and_of_it_what_the_lds_accepted() -> None:

@@ -8,7 +8,7 @@ from typing import Any, cast
 import numpy as np
 import pytest
 
-from pipeline.stages.lds.link_monitors import disorder
+from pipeline.stages.lds.link_monitors import count_out_of_order
 from schemas.config import Configuration, LdsConfig
 
 CONFIG = Configuration(lds=LdsConfig(odometer_share=0.05))
@@ -34,5 +34,5 @@ def test_two_at_once_or_one_backwards_that_the_odometer_does_not_explain(
         rows_m=np.array([2.0, 1.0]), direction=np.array([1, 1]),
     )  # fmt: skip
     offered = [SimpleNamespace(before=0, epoch=1, sense=sense)] * count
-    assert disorder(cast(Any, offered), 0, cast(Any, journey), CONFIG) == found
-    assert disorder(cast(Any, offered), 3, cast(Any, journey), CONFIG) == (found or 3)
+    assert count_out_of_order(cast(Any, offered), 0, cast(Any, journey), CONFIG) == found
+    assert count_out_of_order(cast(Any, offered), 3, cast(Any, journey), CONFIG) == (found or 3)

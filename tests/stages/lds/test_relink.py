@@ -8,7 +8,7 @@ from typing import Any
 
 import pytest
 
-from pipeline.stages.lds.crossings import Journey, balises_of, reads_of
+from pipeline.stages.lds.crossings import Journey, balises_of_kind, telegrams_on_path
 from pipeline.stages.lds.link_monitors import Relink
 from pipeline.stages.odometry.bound import LOST_M
 from schemas.enums import BaliseKind, NotEvaluated
@@ -96,8 +96,8 @@ def test_a_telegram_is_the_anchor_from_then_on(suspected: bool) -> None:
     relink, journey = relink_of([-12.0] * 10, [0, 1, 2, 3])
     relink.withhold(4, suspected)
     assert moved_m(relink, 6) == pytest.approx(0.0)
-    physical = balises_of(balises_at({"P1": 100.0}, kind="physical"), BaliseKind.PHYSICAL)
-    [read], _ = reads_of(reads_at([(5.5, "P1")]).with_columns(odometer_m=110.0), physical, journey)
+    physical = balises_of_kind(balises_at({"P1": 100.0}, kind="physical"), BaliseKind.PHYSICAL)
+    [read], _ = telegrams_on_path(reads_at([(5.5, "P1")]).with_columns(odometer_m=110.0), physical, journey)
     relink.note_read(read)
     for _ in range(2):
         found = relink.compare(9)
@@ -110,8 +110,8 @@ def test_a_telegram_is_the_anchor_from_then_on(suspected: bool) -> None:
 @pytest.mark.parametrize(("suspected", "moved"), [(True, -2.0), (False, 0.0)])
 def test_after_an_outage_a_tvb_after_the_telegram_is_the_anchor(suspected: bool, moved: float) -> None:
     relink, journey = relink_of([-12.0] * 10, list(range(10)))
-    physical = balises_of(balises_at({"P1": 20.0}, kind="physical"), BaliseKind.PHYSICAL)
-    [read], _ = reads_of(reads_at([(1.5, "P1")]).with_columns(odometer_m=30.0), physical, journey)
+    physical = balises_of_kind(balises_at({"P1": 20.0}, kind="physical"), BaliseKind.PHYSICAL)
+    [read], _ = telegrams_on_path(reads_at([(1.5, "P1")]).with_columns(odometer_m=30.0), physical, journey)
     relink.note_read(read)
     relink.withhold(8, suspected)
     assert moved_m(relink, 9) == pytest.approx(moved)

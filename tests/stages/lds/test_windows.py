@@ -6,7 +6,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from pipeline.stages.lds.crossings import minimal_spacing_m, window_after_turn_m, window_m
+from pipeline.stages.lds.crossings import expectation_window, minimal_spacing_m, window_after_turn
 from schemas.config import LdsConfig
 
 CONFIG = LdsConfig()
@@ -24,7 +24,7 @@ CONFIG = LdsConfig()
 def test_window_is_not_symmetric_about_the_announced_distance(
     distance_m: float, accuracy_m: float, open_m: float, close_m: float
 ) -> None:
-    window = window_m(distance_m, accuracy_m, accuracy_m, CONFIG)
+    window = expectation_window(distance_m, accuracy_m, accuracy_m, CONFIG)
     assert window.open_m == pytest.approx(open_m, abs=1e-9)
     assert window.close_m == pytest.approx(close_m, abs=1e-9)
 
@@ -50,7 +50,7 @@ def test_window_holds_every_reading_within_the_odometer_s_accuracy(
     # The true way lies within the two location accuracies; the reading d is true to 5 m + 5 % of d.
     way_m = distance_m + reading * (accuracy_m + reference_m)
     for odometer_m in ((way_m + 5.0) / 0.95, (way_m - 5.0) / 1.05):
-        window = window_m(distance_m, accuracy_m, reference_m, CONFIG)
+        window = expectation_window(distance_m, accuracy_m, reference_m, CONFIG)
         assert window.open_m - 1e-9 <= odometer_m <= window.close_m + 1e-9
 
 
@@ -59,12 +59,12 @@ def test_minimal_spacing_makes_the_next_window_open_where_this_one_closes(
     distance_m: float, own_m: float, next_m: float, reference_m: float
 ) -> None:
     spacing_m = minimal_spacing_m(distance_m, own_m, next_m, reference_m, CONFIG)
-    close_m = window_m(distance_m, own_m, reference_m, CONFIG).close_m
-    next_open_m = window_m(distance_m + spacing_m, next_m, reference_m, CONFIG).open_m
+    close_m = expectation_window(distance_m, own_m, reference_m, CONFIG).close_m
+    next_open_m = expectation_window(distance_m + spacing_m, next_m, reference_m, CONFIG).open_m
     assert next_open_m == pytest.approx(close_m, abs=1e-6)
 
 
 def test_after_a_turn_the_whole_way_run_counts() -> None:
     # 100 m out and back: 5 % of 200 m, 29 m margin: (29 + 10) / 0.95 either side.
-    window = window_after_turn_m(0.0, 200.0, 29.0, CONFIG)
+    window = window_after_turn(0.0, 200.0, 29.0, CONFIG)
     assert window == pytest.approx((-39.0 / 0.95, 39.0 / 0.95), abs=1e-9)

@@ -8,7 +8,7 @@ import polars as pl
 import pytest
 
 from pipeline.stages.judge.judged import JudgedEpochs
-from pipeline.stages.run_row.lost_time import InUse, LostTime, in_use_of, lost_columns, lost_time, remedies
+from pipeline.stages.run_row.lost_time import InUse, LostTime, lost_columns, lost_time, moving_in_use, remedies
 from schemas.config import Configuration
 from schemas.enums import LostTo, Remedy
 from schemas.words import remedy_words
@@ -210,7 +210,7 @@ def test_where_the_unknown_lies() -> None:
 
     def parts(known: list[bool], **columns: Any) -> InUse:
         judged = arrays_of_table(JudgedEpochs, epochs(TEN_S, judgement=[word[k] for k in known], **columns))
-        return in_use_of(judged, float(lost_columns(judged, CONFIG).moving_s.sum()))
+        return moving_in_use(judged, float(lost_columns(judged, CONFIG).moving_s.sum()))
 
     ends = [False, False, True, True, True, True, True, True, True, False]
     middle = [True, True, True, False, True, True, True, True, True, True]

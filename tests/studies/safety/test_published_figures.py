@@ -5,7 +5,7 @@ import math
 import polars as pl
 import pytest
 
-from pipeline.stages.run_row.bounds import continuity, hours_to_substantiate
+from pipeline.stages.run_row.bounds import continuity_over, hours_to_substantiate
 from pipeline.studies.safety import safety_tables
 from pipeline.studies.safety.architectures import (
     APV_CONTINUITY_RISK,
@@ -183,7 +183,7 @@ class TestContinuity:
         assert pytest.approx(520.8, abs=0.05) == self.MTBF_H
 
     def test_eq_8(self) -> None:
-        assert continuity(15.0, self.MTBF_H) == pytest.approx(math.exp(-8e-6), rel=1e-12)
+        assert continuity_over(15.0, self.MTBF_H) == pytest.approx(math.exp(-8e-6), rel=1e-12)
 
     def test_eq_11_is_not_quite_enough(self) -> None:
         redundant = mtbf_one_of_two_h(520.8)
