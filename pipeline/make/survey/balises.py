@@ -132,7 +132,7 @@ class _Placer:
         self.survey = survey
         self.config = config
         self.ground = network_of(track, network.links)
-        self.everywhere = segments_of(track).search()
+        self.everywhere = segments_of(track).search_in()
 
     def placed(self, row: dict[str, Any]) -> tuple[str, float]:
         """Net element and measure [m] of a row: as given, by coordinates, or by line kilometre."""

@@ -81,7 +81,7 @@ def _doubled(ground: Network, config: SurveyConfig) -> Iterator[Finding]:
     """Tracks that lie on each other; an element that turns back is in pieces, which are compared like others."""
     track = ground.track
     along = places_along(track, SAMPLE_SPACING_M)
-    everywhere = segments_of(track).search()
+    everywhere = segments_of(track).search_in()
     both = []
     # So many at once as can be held.
     for rows in np.array_split(np.arange(len(along.element)), 1 + len(along.element) // 100_000):
@@ -104,7 +104,7 @@ def _open_ends(ground: Network, same_track_m: float, near_ends_m: float) -> Iter
     row = np.where(position == 0, track.first[element], track.first[element + 1] - 1)
     points = points_of(track.latitude_deg[row], track.longitude_deg[row])
     # Farther aside is the next track.
-    candidates = candidates_of(points, ground, segments_of(track).search(), 2 * same_track_m)
+    candidates = candidates_of(points, ground, segments_of(track).search_in(), 2 * same_track_m)
     middle = np.minimum(candidates.along_m, candidates.left_m) > near_ends_m
     for near in np.flatnonzero(middle & (candidates.element != element[candidates.step])).tolist():
         end = int(candidates.step[near])

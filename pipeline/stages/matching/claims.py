@@ -1,11 +1,11 @@
-"""How far it is to the next branch of tracks, and how far behind a switch its branches are one track."""
+"""How sure the matched track is at each epoch, at the time and in hindsight, and the stretches where it is in doubt."""
 
 from __future__ import annotations
 
 import numpy as np
 import polars as pl
 
-from pipeline.stages.paths.path_set import Node, PathSet, Span
+from pipeline.stages.paths.path_set import LifeSpan, Node, PathSet
 from pipeline.stages.track.network import Network
 from schemas.arrays import NS_PER_S, Bools, Floats, Ints, spans_of
 from schemas.config import MatchingConfig
@@ -16,8 +16,8 @@ from schemas.stages import ONE_TRACK_LEFT, MatchedEpochs
 _LONGEST_M = 300.0
 
 
-def branches_beyond_m(network: Network, wanted: set[int]) -> dict[int, float]:
-    """Distance from each oriented element's exit to the next branch [m], infinite to an open end."""
+def distances_to_branch_m(network: Network, wanted: set[int]) -> dict[int, float]:
+    """Distance from each oriented element's exit to the next branch of tracks [m], infinite to an open end."""
     beyond: dict[int, float] = {}
     for start in sorted(wanted):
         chain: list[int] = []
@@ -40,42 +40,43 @@ def branches_beyond_m(network: Network, wanted: set[int]) -> dict[int, float]:
 
 
 @frozen
-class Zone:
-    """Of one end of a line without a branch: the oriented element that leads to the switch there, and how far behind it
-    the branches are one track [m].
+class SwitchZone:
+    """One end of a line without a branch: the oriented element that leads to the switch there (`leading`).
+
+    `length_m`: how far behind the switch the branches are nearer to each other than tracks can be [m].
     """
 
     leading: int
     length_m: float
 
 
-class OneTrack:
-    """How far behind a switch its branches are nearer to each other than tracks can be: `apart_m`.
+class SwitchZones:
+    """Stretches behind switches in which the branches are nearer to each other than tracks can be: `apart_m`.
 
-    That counts for paths that came in there, over the switch or at the beginning: of others it is known on which of the
-    tracks they are.
+    A zone counts for paths that came in there, over the switch or at the beginning: of others it is known on which of
+    the tracks they are.
     """
 
     def __init__(self, found: PathSet, apart_m: float) -> None:
         self._network = found.network
         self._apart_m = apart_m
-        self._zones: dict[int, Zone] = {}
-        self._near = self._spread(found)
+        self._zones: dict[int, SwitchZone] = {}
+        self._near = self._zones_by_node(found)
 
-    def behind_m(self, node: Node) -> Floats:
-        """How far behind the switches at start and end of the node's element the tracks are one [m]."""
-        zones = (self.zone(2 * node.element + 1), self.zone(2 * node.element))
+    def zone_lengths_m(self, node: Node) -> Floats:
+        """Lengths of the zones at start and end of the node's element that count for its path [m], shape (2,)."""
+        zones = (self.zone_beyond(2 * node.element + 1), self.zone_beyond(2 * node.element))
         near = self._near.get(id(node), set())
         return np.array([zone.length_m if zone.leading in near else 0.0 for zone in zones])
 
-    def zone(self, oriented: int) -> Zone:
-        """The zone of the line's end beyond the exit of an element."""
+    def zone_beyond(self, oriented: int) -> SwitchZone:
+        """The zone at the end of a line, beyond the exit of an oriented element of it."""
         if oriented not in self._zones:
-            self._zones[oriented] = self._measured(oriented)
+            self._zones[oriented] = self._measure_zone(oriented)
         return self._zones[oriented]
 
-    def _spread(self, found: PathSet) -> dict[int, set[int]]:
-        """Per hypothesis the ends of its line near which the path came to it, by the elements that lead there."""
+    def _zones_by_node(self, found: PathSet) -> dict[int, set[int]]:
+        """Per hypothesis the zones that count for it, by the elements that lead to their switches."""
         onward: dict[int, list[Node]] = {}
         near: dict[int, set[int]] = {}
         waiting = []
@@ -84,7 +85,7 @@ class OneTrack:
             for origin in along:
                 onward.setdefault(id(origin), []).append(node)
             if len(along) < len(node.origins) or not along:
-                near[id(node)] = self._begun_near(node)
+                near[id(node)] = self._zones_of_begin(node)
                 waiting.append(node)
         while waiting:
             node = waiting.pop()
@@ -95,27 +96,27 @@ class OneTrack:
                     waiting.append(child)
         return near
 
-    def _begun_near(self, node: Node) -> set[int]:
-        """Ends of its line near which a hypothesis begins, by the elements that lead there."""
+    def _zones_of_begin(self, node: Node) -> set[int]:
+        """Zones in which a hypothesis begins, by the elements that lead to their switches."""
         begun_m = node.left_m[0] if len(node.left_m) else np.zeros(2)
         near = set()
         for side in (0, 1):
             # Towards its start an element is left as `2 e + 1`, towards its end as `2 e`.
             leaving = 2 * node.element + 1 - side
-            zone = self.zone(leaving)
-            if begun_m[side] + self._beyond_m(leaving, zone.leading) < zone.length_m:
+            zone = self.zone_beyond(leaving)
+            if begun_m[side] + self._distance_between_exits_m(leaving, zone.leading) < zone.length_m:
                 near.add(zone.leading)
         return near
 
-    def _beyond_m(self, oriented: int, last: int) -> float:
-        """Distance from the exit of an element to that of a later one on its line [m]."""
+    def _distance_between_exits_m(self, oriented: int, last: int) -> float:
+        """Distance from the exit of an element to the exit of a later one on its line [m]."""
         beyond_m = 0.0
         while oriented != last:
             oriented = self._network.successors[oriented][0].to
             beyond_m += self._network.length_m(oriented)
         return beyond_m
 
-    def _measured(self, oriented: int) -> Zone:
+    def _measure_zone(self, oriented: int) -> SwitchZone:
         """Follow a line to its first switch and measure how far behind that the branches are one track."""
         network = self._network
         line, distance_m = [oriented], 0.0
@@ -123,15 +124,15 @@ class OneTrack:
             back = network.successors[onward[0].to ^ 1]
             if len(back) > 1:
                 own = line[-1] ^ 1
-                shared_m = (self._together_m(own, edge.to) for edge in back if edge.to != own)
-                return Zone(line[-1], max(shared_m))
+                shared_m = (self._shared_length_m(own, edge.to) for edge in back if edge.to != own)
+                return SwitchZone(line[-1], max(shared_m))
             line.append(onward[0].to)
             distance_m += network.length_m(line[-1])
-        return Zone(line[-1], 0.0)
+        return SwitchZone(line[-1], 0.0)
 
-    def _together_m(self, one: int, other: int) -> float:
-        """Distance from their common begin over which two branches are nearer than `apart_m`."""
-        distances_m, places = zip(*(self._drawn(oriented) for oriented in (one, other)), strict=True)
+    def _shared_length_m(self, one: int, other: int) -> float:
+        """Distance from their common begin over which two branches are nearer than `apart_m` [m]."""
+        distances_m, places = zip(*(self._line_from(oriented) for oriented in (one, other)), strict=True)
         last_m = min(float(distance_m[-1]) for distance_m in distances_m)
         at_m = np.union1d(*distances_m)
         at_m = at_m[at_m <= last_m]
@@ -148,9 +149,10 @@ class OneTrack:
             return 0.0
         return float(np.interp(self._apart_m, apart_m[row - 1 : row + 1], at_m[row - 1 : row + 1]))
 
-    def _drawn(self, oriented: int) -> tuple[Floats, Floats]:
-        """A line from an element's entry on, up to the next choice: distance from there [m] and places of its
-        points.
+    def _line_from(self, oriented: int) -> tuple[Floats, Floats]:
+        """The line from an element's entry on, up to the next choice.
+
+        Distances from there [m], and places of its points.
         """
         network, track = self._network, self._network.track
         line = [oriented]
@@ -204,7 +206,7 @@ class Possible:
 
 @frozen
 class Claims:
-    """Per epoch the confidence in its track: `live`, by what came before, and in `hindsight`; NaN while off.
+    """Per epoch the confidence in its track: `live`, by what came before, and in `hindsight`; NaN off the network.
 
     `rival`: the element that is hardest to tell from it, -1 where none is left; `possible`: all of them.
     """
@@ -228,13 +230,13 @@ class _LinesLeft:
     p: Floats
     branch_m: Floats
 
-    def rival(self, step: Ints, group: Ints) -> tuple[Ints, Floats]:
-        """The likeliest element off the line of each epoch, -1 for none, and its p-value."""
+    def likeliest_rival(self, step: Ints, group: Ints) -> tuple[Ints, Floats]:
+        """The likeliest element off the line of each epoch, -1 for none, and its p-value; `group`: lines of epochs."""
         other = np.where(self.line[step, 0] != group, 0, 1)
         return self.element[step, other], self.p[step, other]
 
 
-def claims(found: PathSet, t_s: Floats, element: Ints, sigma_m: Floats, config: MatchingConfig) -> Claims:
+def claim_tracks(found: PathSet, t_s: Floats, element: Ints, sigma_m: Floats, config: MatchingConfig) -> Claims:
     """The confidence that each epoch lies on the track shown, as known at the time and in hindsight.
 
     Live an epoch uses the steps that ended before it, and of their rejections those of `paths_delay_s` ago. The set is
@@ -267,25 +269,28 @@ def claims(found: PathSet, t_s: Floats, element: Ints, sigma_m: Floats, config: 
     driven_m = config.paths_faster * speed_mps[np.maximum(before, 0)] * since_s
     carried_m = driven_m + config.paths_along_sigmas * np.nan_to_num(sigma_m)
     group = np.where(element >= 0, found.groups[np.maximum(element, 0)], -1)
-    alone = _alone(found)
-    live = _lines_left(found, found.living(config.paths_delay_s), OneTrack(found, config.paths_one_track_m))
+    alone = _have_one_line(found)
+    live = _lines_left(found, found.living(config.paths_delay_s), SwitchZones(found, config.paths_one_track_m))
     at = np.maximum(before, 0)
-    gate = _confidence(live, at, group, carried_m, alone)
+    gate = _confidence_by_step(live, at, group, carried_m, alone)
     gate[before < 0] = 0.0
     gate[found.unclaimed[at]] = np.minimum(gate[found.unclaimed[at]], MOST_IN_DOUBT)
-    spans = found.to_the_end()
+    spans = found.surviving_spans()
     left = _lines_left(found, spans)
-    later = _hindsight(left, about, group, alone)
+    later = _confidence_in_hindsight(left, about, group, alone)
     later[found.unclaimed[about]] = np.minimum(later[found.unclaimed[about]], MOST_IN_DOUBT)
-    now, p_now = live.rival(at, group)
-    then, p_then = left.rival(about, group)
+    now, p_now = live.likeliest_rival(at, group)
+    then, p_then = left.likeliest_rival(about, group)
     rival = np.where((now >= 0) & (p_now >= p_then), now, then)
     epoch = np.minimum(np.searchsorted(t_s, steps.begin_s), t_s.size - 1)
-    return Claims(gate, later, rival, _possible(found, spans, epoch))
+    return Claims(gate, later, rival, _possible_elements(found, spans, epoch))
 
 
 def doubtful_stretches(claimed: Claims, t_ns: Ints, element: Ints, read: Bools, network: Network) -> pl.DataFrame:
-    """Stretches where the path is doubtful at the time, or in hindsight; `read`: epochs at which a balise was read."""
+    """Stretches where the track is doubtful, at the time or in hindsight; rows of `AMBIGUOUS_COLUMNS`.
+
+    `read`: epochs at which a balise was read.
+    """
     least = np.fmin(np.nan_to_num(claimed.live), np.nan_to_num(claimed.hindsight))
     ids = network.track.ids
     groups = network.unbranched
@@ -307,10 +312,10 @@ def doubtful_stretches(claimed: Claims, t_ns: Ints, element: Ints, read: Bools, 
     return pl.DataFrame(rows, schema=AMBIGUOUS_COLUMNS, orient="row")
 
 
-def off_stretches(claimed: Claims, epochs: MatchedEpochs, least_s: float) -> pl.DataFrame:
-    """Stretches on no path of the network, by what was known then; shorter ones are jumps.
+def off_network_stretches(claimed: Claims, epochs: MatchedEpochs, least_s: float) -> pl.DataFrame:
+    """Stretches of at least `least_s` on no path of the network, by what was known then; rows of `OFF_COLUMNS`.
 
-    Named by the element next to which most of them lay; `offset_m` left of its own sense.
+    Shorter ones are jumps. Named by the element next to which most of them lay; `offset_m` left of its own sense.
     """
     off = np.isnan(claimed.live) & epochs.near_track & (epochs.element >= 0)
     parts = []
@@ -335,7 +340,7 @@ def off_stretches(claimed: Claims, epochs: MatchedEpochs, least_s: float) -> pl.
     return pl.concat(parts) if parts else pl.DataFrame(schema=OFF_COLUMNS)
 
 
-def _possible(found: PathSet, spans: list[Span], epoch: Ints) -> Possible:
+def _possible_elements(found: PathSet, spans: list[LifeSpan], epoch: Ints) -> Possible:
     """Elements that hypotheses cover at each step, with a confidence shared among their lines."""
     count = len(found.steps)
     elements = found.network.count
@@ -348,33 +353,33 @@ def _possible(found: PathSet, spans: list[Span], epoch: Ints) -> Possible:
     return Possible(epoch, np.searchsorted(step, np.arange(count + 1)), element, confidence)
 
 
-def _lines_left(found: PathSet, spans: list[Span], one_track: OneTrack | None = None) -> _LinesLeft:
-    """What the sets come to, the likeliest line first; of equal ones that found first.
+def _lines_left(found: PathSet, spans: list[LifeSpan], one_track: SwitchZones | None = None) -> _LinesLeft:
+    """What is left of the set at each step: its line, and the two likeliest, of equal ones that found first.
 
     `one_track`: a path is near the branch until the other branches of a switch that it came over are another track.
     """
     count = len(found.steps)
     ends = {2 * node.element + side for node, *_ in spans for side in (0, 1)}
-    beyond_m = branches_beyond_m(found.network, ends)
+    beyond_m = distances_to_branch_m(found.network, ends)
     line = np.full((count, 2), -1)
     element = np.full((count, 2), -1)
     p = np.zeros((count, 2))
     branch_m = np.full(count, np.inf)
     for node, begin, end, value in spans:
         own = int(found.groups[node.element])
-        _enter_path(line[begin:end], element[begin:end], p[begin:end], (own, node.element), value)
+        _enter_among_likeliest(line[begin:end], element[begin:end], p[begin:end], (own, node.element), value)
         beyond = np.array([beyond_m[2 * node.element + 1], beyond_m[2 * node.element]])
         ends_m = node.left_m[: end - begin] + beyond
         if one_track is not None:
-            ends_m -= one_track.behind_m(node)
+            ends_m -= one_track.zone_lengths_m(node)
         part = slice(begin, begin + len(ends_m))
         branch_m[part] = np.minimum(branch_m[part], ends_m.min(axis=1))
     group = np.where(line[:, 1] < 0, line[:, 0], -2)
     return _LinesLeft(group, line, element, p, branch_m)
 
 
-def _enter_path(line: Ints, element: Ints, p: Floats, one: tuple[int, int], value: Floats) -> None:
-    """Enter a path over a line and element with its p-values among the two likeliest lines of each step."""
+def _enter_among_likeliest(line: Ints, element: Ints, p: Floats, one: tuple[int, int], value: Floats) -> None:
+    """Enter a path, `one` its line and element, with its p-values among the two likeliest lines of each step."""
     for place in (0, 1):
         better = (line[:, place] < 0) | (value > p[:, place])
         if place == 0:
@@ -386,29 +391,30 @@ def _enter_path(line: Ints, element: Ints, p: Floats, one: tuple[int, int], valu
         line[better, place], element[better, place], p[better, place] = *one, value[better]
 
 
-def _confidence(left: _LinesLeft, step: Ints, group: Ints, carried_m: Floats, alone: Floats) -> Floats:
-    """Confidence of each epoch in its line, with the step that speaks for it; NaN off the network.
+def _confidence_by_step(left: _LinesLeft, step: Ints, group: Ints, carried_m: Floats, alone: Floats) -> Floats:
+    """Confidence of each epoch in its line, by the step that speaks for it; NaN off the network.
 
-    Near a branch the rivals are those behind it: nothing is known of them yet.
+    `carried_m`: how far the train may have come since. Near a branch the rivals are those behind it: nothing is known
+    of them yet.
     """
     one = (left.group[step] == group) & (group >= 0) & (carried_m < left.branch_m[step])
-    rival, p = left.rival(step, group)
+    rival, p = left.likeliest_rival(step, group)
     doubted = np.minimum(MOST_IN_DOUBT, 1.0 - np.where(rival >= 0, p, 0.5))
     claimed = np.where(alone[step] > 0, ALONE, ONE_TRACK_LEFT)
     return np.where(one, claimed, np.where(left.group[step] == -1, np.nan, doubted))
 
 
-def _hindsight(left: _LinesLeft, step: Ints, group: Ints, alone: Floats) -> Floats:
+def _confidence_in_hindsight(left: _LinesLeft, step: Ints, group: Ints, alone: Floats) -> Floats:
     """Confidence by paths that live to the end; where one goes over to the next line, positions say when."""
-    confidence = _confidence(left, step, group, np.zeros(step.size), alone)
+    confidence = _confidence_by_step(left, step, group, np.zeros(step.size), alone)
     neighbours = [np.clip(step + by, 0, left.group.size - 1) for by in (-1, 0, 1)]
     one = np.logical_and.reduce([left.group[row] >= 0 for row in neighbours])
     one &= np.logical_or.reduce([left.group[row] == group for row in neighbours])
     return np.where(one & (confidence < ONE_TRACK_LEFT), ONE_TRACK_LEFT, confidence)
 
 
-def _alone(found: PathSet) -> Floats:
-    """Steps at which one line alone is within reach."""
+def _have_one_line(found: PathSet) -> Floats:
+    """1 at steps at which one line alone is within reach, else 0."""
     lines = found.groups[found.candidates.element]
     pairs = np.unique(np.column_stack([found.candidates.step, lines]), axis=0)
     return np.asarray(np.bincount(pairs[:, 0], minlength=len(found.steps)) == 1, dtype=np.float64)

@@ -1,4 +1,4 @@
-"""One solution's positions as arrays, with their covariance or a table's sigma in its place, and their digits."""
+"""One solution's positions as arrays with their sigmas, and as epochs on the path."""
 
 from __future__ import annotations
 
@@ -65,8 +65,8 @@ def fixes_of(frame: pl.DataFrame, sigma: FixSigma) -> Fixes:
     Returns:
         Arrays of shape (n,), NaN where not known.
     """
-    column = {name: _floats(frame, name) for name in _NUMBERS}
-    fix = _kinds(frame["fix"])
+    column = {name: _optional_floats(frame, name) for name in _NUMBERS}
+    fix = _fix_numbers(frame["fix"])
     table_m = np.array([*(sigma.horizontal_m(kind) for kind in Fix), None], dtype=np.float64)
     valid = np.isfinite(column["latitude_deg"]) & np.isfinite(column["longitude_deg"])
     valid &= fix != _KINDS.index(Fix.NONE.value)
@@ -99,8 +99,8 @@ def fixes_of(frame: pl.DataFrame, sigma: FixSigma) -> Fixes:
     )
 
 
-def contradictory_covariances(frame: pl.DataFrame) -> int:
-    """Epochs of a `gnss` stream whose `cov_en_m2` no covariance with these variances can have."""
+def count_contradictory_covariances(frame: pl.DataFrame) -> int:
+    """How many epochs of a `gnss` stream have a `cov_en_m2` that no covariance with these variances can have."""
     ee, en, nn = (pl.col(f"cov_{axes}_m2") for axes in ("ee", "en", "nn"))
     return frame.filter((ee > 0) & (nn > 0) & (en**2 >= ee * nn)).height
 
@@ -112,15 +112,15 @@ _NUMBERS = (
 )
 
 
-def _floats(frame: pl.DataFrame, name: str) -> Floats:
+def _optional_floats(frame: pl.DataFrame, name: str) -> Floats:
     """A column with null as NaN; an optional column that is absent is not known."""
     if name not in frame.columns:
         return np.full(frame.height, np.nan)
     return frame[name].cast(pl.Float64).to_numpy()
 
 
-def _kinds(fix: pl.Series) -> Ints:
-    """Kinds of fix by their number; the number after the last is not known."""
+def _fix_numbers(fix: pl.Series) -> Ints:
+    """Kinds of fix by their number in `Fix`; the number after the last where not known."""
     return fix.cast(pl.Enum(_KINDS)).to_physical().cast(pl.Int64).fill_null(len(_KINDS)).to_numpy()
 
 
@@ -128,21 +128,19 @@ def _kinds(fix: pl.Series) -> Ints:
 _ROUNDED_M = 1e-4
 
 
-def digit_steps(fixes: pl.DataFrame, least_m: float) -> tuple[float, float, float]:
-    """Deviation to the north, to the east and of the height by the steps of the recorded coordinates [m].
+def digit_deviations_m(fixes: pl.DataFrame, least_m: float) -> tuple[float, float, float]:
+    """Deviations by the last digit of the recorded coordinates [m]: north, east, height.
 
     Five decimals of a degree, NMEA of four decimals of a minute, or single precision move each position by up to half a
     step, the next one by something else: at 10 Hz metres per second. Only the digits are looked at, so no fault of the
-    position can pass for it.
-
-    `fixes`: those of one solution. `least_m`: finer steps count for nothing.
+    position can pass for it. `fixes`: those of one solution. `least_m`: finer steps count for nothing.
     """
     latitude = floats(fixes, "latitude_deg")
     known = latitude[np.isfinite(latitude)]
     north_per_deg = np.radians(1.0) * MEAN_RADIUS_M
     east_per_deg = north_per_deg * np.cos(np.radians(known.mean())) if known.size else north_per_deg
     north, east, up = (
-        step_m(values[np.isfinite(values)], scale, least_m) / np.sqrt(12.0)
+        coordinate_step_m(values[np.isfinite(values)], scale, least_m) / np.sqrt(12.0)
         for values, scale in (
             (latitude, north_per_deg),
             (floats(fixes, "longitude_deg"), east_per_deg),
@@ -152,8 +150,8 @@ def digit_steps(fixes: pl.DataFrame, least_m: float) -> tuple[float, float, floa
     return north, east, up
 
 
-def step_m(values: Floats, metres: float, least_m: float) -> float:
-    """The step of a recorded coordinate [m], 0 where there is none of `least_m`; `metres`: of one unit of it."""
+def coordinate_step_m(values: Floats, metres: float, least_m: float) -> float:
+    """The step of a recorded coordinate [m], 0 where none is as large as `least_m`; `metres`: of one unit of it."""
     changes = np.diff(values)
     # At speed the changes themselves are many steps each, but the change of the change is one at times.
     return metres * step_of(changes, np.diff(changes), least_m / metres, _ROUNDED_M / metres)
@@ -164,7 +162,7 @@ _RECEIVER, _TABLE = (SIGMA_SOURCES.index(source) for source in (SigmaSource.RECE
 
 @frozen
 class Assignment:
-    """What the search found per epoch: leg, a hint at the passage [m], and how sure it is."""
+    """What the search found per epoch: leg, path position near which it lies [m], and how sure it is."""
 
     leg: Ints
     near_path_m: Floats
@@ -173,7 +171,7 @@ class Assignment:
 
 
 @frozen
-class Placed:
+class PlacedEpochs:
     """Every epoch on its leg: its foot, path position of the antenna and height over the track [m], NaN if unknown."""
 
     feet: Feet
@@ -181,15 +179,15 @@ class Placed:
     vertical_m: Floats
 
     @classmethod
-    def on(cls, fixes: Fixes, path: TravelledPath, assignment: Assignment) -> Placed:
+    def on_path(cls, fixes: Fixes, path: TravelledPath, assignment: Assignment) -> PlacedEpochs:
         """Project every epoch onto its leg."""
         feet = path.feet(fixes.points, assignment.leg, fixes.valid, assignment.near_path_m)
         return cls(feet, *path.places(assignment.leg, feet, fixes.height_m))
 
 
 @frozen
-class Shape:
-    """The track at places of the path."""
+class TrackShape:
+    """Direction [deg], slope, curvature [1/m] and quality of the survey [m] at places of the path."""
 
     heading_deg: Floats
     slope: Floats
@@ -205,16 +203,16 @@ class Shape:
 
 
 @frozen
-class Written:
-    """How a solution is written down: its name, and the deviation by its coordinates' steps [m] (`digit_steps`)."""
+class RecordedDigits:
+    """Name of a solution, and deviations by the last digit of its coordinates (`digit_deviations_m`)."""
 
     solution: str
     north_m: float
     east_m: float
     up_m: float
 
-    def turned_m(self, shape: Shape) -> tuple[Floats, Floats, Floats]:
-        """The same along and across the track, and of the height [m]; shape (epochs,)."""
+    def along_cross_up_m(self, shape: TrackShape) -> tuple[Floats, Floats, Floats]:
+        """The deviations along and across the track, and of the height [m]; shapes (epochs,)."""
         turned = np.radians(np.nan_to_num(shape.heading_deg))
         along = np.hypot(self.north_m * np.cos(turned), self.east_m * np.sin(turned))
         cross = np.hypot(self.north_m * np.sin(turned), self.east_m * np.cos(turned))
@@ -223,10 +221,10 @@ class Written:
 
 def matched_epochs(
     fixes: Fixes,
-    written: Written,
+    written: RecordedDigits,
     path: TravelledPath,
     assignment: Assignment,
-    placed: Placed,
+    placed: PlacedEpochs,
     vehicle: Vehicle,
     config: MatchingConfig,
 ) -> MatchedEpochs:
@@ -255,13 +253,13 @@ def matched_epochs(
     numbers = {name: number for number, name in enumerate(dict.fromkeys(path.track.ids))}
     of_piece = [numbers[name] for name in path.track.ids]
     # The track's direction counts where the GNSS antenna is, not the balise antenna.
-    shape = shape_at(path, assignment.leg, antenna_m)
+    shape = track_shape_at(path, assignment.leg, antenna_m)
     sigma_along_m, sigma_cross_m = track_sigmas_m(fixes, shape)
     allowed_m = on_track_limit_m(sigma_cross_m, shape.survey_sigma_m, config)
     distance_m = np.nan_to_num(feet.distance_m, nan=np.inf)
     on_track = fixes.valid & (distance_m <= np.nan_to_num(allowed_m))
     source = np.where(fixes.from_receiver, _RECEIVER, _TABLE)
-    digits_along_m, digits_cross_m, digits_up_m = written.turned_m(shape)
+    digits_along_m, digits_cross_m, digits_up_m = written.along_cross_up_m(shape)
     return MatchedEpochs(
         t_ns=fixes.t_ns,
         solution=written.solution,
@@ -294,9 +292,9 @@ def matched_epochs(
     )
 
 
-def shape_at(path: TravelledPath, leg: Ints, path_m: Floats) -> Shape:
+def track_shape_at(path: TravelledPath, leg: Ints, path_m: Floats) -> TrackShape:
     """Direction, slope, curvature and survey quality of the track at places of the path."""
-    shape = Shape(*(np.full(len(path_m), np.nan) for _ in range(5)))
+    shape = TrackShape(*(np.full(len(path_m), np.nan) for _ in range(5)))
     for index, line in enumerate(path.legs):
         rows = np.flatnonzero((leg == index) & np.isfinite(path_m))
         segment, fraction = segments_at(line, path_m[rows])
@@ -316,7 +314,7 @@ def shape_at(path: TravelledPath, leg: Ints, path_m: Floats) -> Shape:
     return shape
 
 
-def track_sigmas_m(fixes: Fixes, shape: Shape) -> tuple[Floats, Floats]:
+def track_sigmas_m(fixes: Fixes, shape: TrackShape) -> tuple[Floats, Floats]:
     """The horizontal covariance turned into the track's frame: sigma along and across [m]."""
     sin, cos = shape.direction
     ee = fixes.cov_ee_m2
@@ -334,14 +332,14 @@ def on_track_limit_m(sigma_cross_m: Floats, survey_sigma_m: Floats, config: Matc
     return np.asarray(np.minimum(config.on_track_sigmas * spread_m, config.reach_m))
 
 
-def velocity_along_mps(fixes: Fixes, shape: Shape) -> Floats:
-    """GNSS velocity along growing path, on the slope where the track has one."""
+def velocity_along_mps(fixes: Fixes, shape: TrackShape) -> Floats:
+    """GNSS velocity along growing path [m/s], on the slope where the track has one."""
     east, north = shape.direction
     level = fixes.vel_e_mps * east + fixes.vel_n_mps * north
     return np.asarray(level * np.sqrt(1.0 + np.nan_to_num(shape.slope) ** 2))
 
 
 def _slope(rise_m: Floats, length_m: Floats) -> Floats:
-    """Rise over run, from rise and 3-D length; NaN without heights."""
+    """Rise over run, from rise and 3-D length [m]; NaN without heights."""
     run = np.sqrt(np.maximum(length_m * length_m - rise_m * rise_m, 1e-12))
     return np.asarray(rise_m / run)

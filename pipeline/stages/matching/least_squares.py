@@ -1,10 +1,10 @@
-"""Where each step may have been on the network, and what it costs to say so."""
+"""The path of least squares through the places where each step may have been, and its legs (Viterbi 1967)."""
 
 from __future__ import annotations
 
 import numpy as np
 
-from pipeline.stages.paths.candidates import Candidates, overtaken
+from pipeline.stages.paths.candidates import Candidates, belong_beyond
 from pipeline.stages.paths.path_set import PathSet
 from pipeline.stages.paths.path_steps import Move, Moves, PathSteps, Place
 from pipeline.stages.track.network import Network
@@ -32,21 +32,21 @@ class PathStates:
 
 
 def path_states(found: PathSet, height_m: Floats, sigma_up_m: Floats, config: MatchingConfig) -> PathStates:
-    """All places within reach, of steps with one at least.
+    """Every place within reach of each step, with its cost; steps without any are left out.
 
     `height_m`, `sigma_up_m`: of each step over the survey's zero, NaN where unknown. All elements at a step are weighed
     by one sigma, else a coarse survey would win. Where the set knows where the train may have been, every other place
     costs as much as a position that no error explains.
     """
     steps, network = found.steps, found.network
-    candidates = found.candidates.take(np.flatnonzero(~overtaken(found.candidates, network)), len(steps))
+    candidates = found.candidates.take(np.flatnonzero(~belong_beyond(found.candidates, network)), len(steps))
     kept = np.diff(candidates.first) > 0
     variance_m2 = (config.cross_bias_sigma_m**2 + steps.sigma_m**2)[candidates.step]
     most = config.outlier_sigmas**2
     cost = np.minimum(candidates.distance_m**2 / variance_m2, most)
     refuted = _are_refuted(found, candidates)
     cost = np.where(refuted, most, cost + _height_costs(candidates, height_m, sigma_up_m, config))
-    candidates = candidates.renumbered(kept)
+    candidates = candidates.with_steps_renumbered(kept)
     both = np.column_stack([2 * candidates.element, 2 * candidates.element + 1])
     index = np.flatnonzero(network.usable[both].ravel())
     oriented = both.ravel()[index]
@@ -62,7 +62,7 @@ def path_states(found: PathSet, height_m: Floats, sigma_up_m: Floats, config: Ma
     )
 
 
-def unbroken(states: PathStates, steps: PathSteps, config: MatchingConfig) -> Bools:
+def continues_unchanged(states: PathStates, steps: PathSteps, config: MatchingConfig) -> Bools:
     """Steps that follow the one before at once, with the same states.
 
     But for one every `break_s` where there are several: a path may break off there.
@@ -84,7 +84,7 @@ def _are_refuted(found: PathSet, candidates: Candidates) -> Bools:
     """Candidates on an element that the whole run refutes; none where every path is refuted."""
     count = len(found.steps)
     elements = found.network.count
-    lives = found.to_the_end()
+    lives = found.surviving_spans()
     # Between two elements a step belongs to either.
     spans = [(node.element, max(begin - 1, 0), min(end + 1, count)) for node, begin, end, _ in lives]
     # Step and element in one number, to be looked up by `isin`.
@@ -116,7 +116,7 @@ def _height_costs(candidates: Candidates, height_m: Floats, sigma_up_m: Floats, 
 
 
 def polarity_of_parts(network: Network, states: PathStates, counted_m: Floats) -> Ints:
-    """Sign of the odometer against each oriented element: +1, -1, or 0 where unknown.
+    """Sign of the odometer against each oriented element: +1, -1, or 0 where unknown; shape (oriented elements,).
 
     `counted_m`: per step of the states the distance since the step before, signed, NaN where unknown. The sign belongs
     to the installation and holds for the whole run, but the orientation of a connected part of the network is
@@ -165,9 +165,9 @@ class PathCourse:
         return Place(int(self.step[row]), int(self.oriented[row]), float(self.place_m[row]))
 
 
-def least_squares(states: PathStates, moves: Moves) -> PathCourse:
-    """The steps that lie on the path of least cost."""
-    begins = np.flatnonzero(~(unbroken(states, moves.steps, moves.config) & _without_relations(states, moves)))
+def least_squares_course(states: PathStates, moves: Moves) -> PathCourse:
+    """The steps, with their places, on the path of least cost through the states."""
+    begins = np.flatnonzero(~(continues_unchanged(states, moves.steps, moves.config) & _are_unrelated(states, moves)))
     ends = np.append(begins[1:], len(states.step))
     alive: dict[int, _Reached] = {}
     for block, (begin, end) in enumerate(zip(begins.tolist(), ends.tolist(), strict=True)):
@@ -175,8 +175,8 @@ def least_squares(states: PathStates, moves: Moves) -> PathCourse:
     return _trace_back(states, begins, ends, min(alive.values(), key=lambda reached: reached.cost))
 
 
-def _without_relations(states: PathStates, moves: Moves) -> Bools:
-    """Steps at which no state leads to another at once."""
+def _are_unrelated(states: PathStates, moves: Moves) -> Bools:
+    """Steps at which no state leads to another one over a relation."""
     apart = np.ones(len(states.step), dtype=np.bool_)
     known: dict[tuple[int, ...], bool] = {}
     oriented = states.oriented.tolist()
@@ -192,7 +192,10 @@ def _without_relations(states: PathStates, moves: Moves) -> Bools:
 def _extend_to_block(
     states: PathStates, moves: Moves, alive: dict[int, _Reached], block: int, begin: int, end: int
 ) -> dict[int, _Reached]:
-    """The cheapest path to each state of a block of steps with the same states, and those carried on past it."""
+    """The cheapest path to each state of a block of steps with equal states, and those carried on past it.
+
+    `alive`: the cheapest paths so far, by oriented element; `begin`, `end`: of the block among the steps of the states.
+    """
     rows = slice(int(states.first[begin]), int(states.first[begin + 1]))
     size = rows.stop - rows.start
     sums = states.cost[rows.start : int(states.first[end])].reshape(end - begin, size).sum(axis=0).tolist()
@@ -209,7 +212,7 @@ def _extend_to_block(
         before = cheapest
         for reached in alive.values():
             if reached.cost < least:
-                cost = reached.cost + moves.cost(reached.place, there, distances[reached.place.step])
+                cost = reached.cost + moves.least_cost(reached.place, there, distances[reached.place.step])
                 if cost < least:
                     least, before = cost, reached
         place = Place(int(states.step[end - 1]), here, last_m[number])
@@ -226,7 +229,7 @@ def _extend_to_block(
 
 
 def _trace_back(states: PathStates, begins: Ints, ends: Ints, last: _Reached) -> PathCourse:
-    """Follow the cheapest path back."""
+    """The course that the cheapest path `last` took, from its first block on."""
     parts: list[Ints] = []
     rows: list[Ints] = []
     reached: _Reached | None = last
@@ -241,16 +244,16 @@ def _trace_back(states: PathStates, begins: Ints, ends: Ints, last: _Reached) ->
 
 
 @frozen
-class Decoded:
-    """Legs, and for each step its leg, element number in it and place from that element's entry [m]."""
+class LegsOfSteps:
+    """The legs of a course as chains, and for each step its leg, element number there and place from its entry [m]."""
 
     chains: tuple[Chain, ...]
     leg: Ints
     number: Ints
     place_m: Floats
 
-    def turned(self, network: Network, legs: range) -> Decoded:
-        """Some legs run in the other direction."""
+    def with_legs_turned(self, network: Network, legs: range) -> LegsOfSteps:
+        """The same with some legs run in the other direction."""
         chains = tuple(chain.turned(network) if index in legs else chain for index, chain in enumerate(self.chains))
         inside = (self.leg >= legs.start) & (self.leg < legs.stop)
         length = np.array(
@@ -260,11 +263,11 @@ class Decoded:
             ]
         )
         number = np.where(inside, -self.number, self.number)
-        return Decoded(chains, self.leg, number, np.where(inside, length - self.place_m, self.place_m))
+        return LegsOfSteps(chains, self.leg, number, np.where(inside, length - self.place_m, self.place_m))
 
 
-def decode(course: PathCourse, moves: Moves) -> Decoded:
-    """Follow the course over the network, elements without any fix included."""
+def split_into_legs(course: PathCourse, moves: Moves) -> LegsOfSteps:
+    """The course as legs, elements without any fix included; a new leg begins where the network does not lead on."""
     oriented = course.oriented
     chains = [Chain((int(oriented[0]),), (0.0,))]
     leg = np.zeros(len(oriented), dtype=np.int64)
@@ -275,11 +278,11 @@ def decode(course: PathCourse, moves: Moves) -> Decoded:
         leg[before:row] = len(chains) - 1
         number[before:row] = at
         before = row
-        move = moves.best(course.place(row - 1), course.place(row))
-        at = _follow(chains, moves.network, at, move, int(oriented[row]))
+        move = moves.best_move(course.place(row - 1), course.place(row))
+        at = _extend_legs(chains, moves.network, at, move, int(oriented[row]))
     leg[before:] = len(chains) - 1
     number[before:] = at
-    return Decoded(tuple(chains), leg, number, course.place_m)
+    return LegsOfSteps(tuple(chains), leg, number, course.place_m)
 
 
 def _element_changes(course: PathCourse) -> Bools:
@@ -287,7 +290,7 @@ def _element_changes(course: PathCourse) -> Bools:
     return np.concatenate([[False], course.oriented[1:] != course.oriented[:-1]])
 
 
-def legs_of(moves: Moves, course: PathCourse, decoded: Decoded) -> list[Leg]:
+def legs_with_positions(moves: Moves, course: PathCourse, decoded: LegsOfSteps) -> list[Leg]:
     """Legs with one path position: equal on what two legs share, carried on by distance over a break."""
     legs: list[Leg] = []
     for index, chain in enumerate(decoded.chains):
@@ -303,8 +306,8 @@ def legs_of(moves: Moves, course: PathCourse, decoded: Decoded) -> list[Leg]:
     return legs
 
 
-def positions_m(decoded: Decoded, legs: list[Leg]) -> Floats:
-    """Path position of each step."""
+def step_positions_m(decoded: LegsOfSteps, legs: list[Leg]) -> Floats:
+    """Path position of each step [m]."""
     entries = [[leg.entry_m(number) for number in range(len(leg.visits))] for leg in legs]
     return np.array(
         [
@@ -316,19 +319,19 @@ def positions_m(decoded: Decoded, legs: list[Leg]) -> Floats:
     )
 
 
-def aligned(moves: Moves, course: PathCourse, decoded: Decoded) -> Decoded:
-    """After a break the path goes on in the direction it had: legs beyond it are turned where needed."""
+def with_direction_kept(moves: Moves, course: PathCourse, decoded: LegsOfSteps) -> LegsOfSteps:
+    """The legs, those beyond a break turned where needed, so that the path goes on in the direction it had."""
     for index, chain in enumerate(decoded.chains):
         if index and chain.shared is None:
-            legs = legs_of(moves, course, decoded)
+            legs = legs_with_positions(moves, course, decoded)
             turn = _heading_at(decoded, legs, index) - _heading_at(decoded, legs, index, before=True)
             if np.cos(np.radians(turn)) < 0:
-                decoded = decoded.turned(moves.network, range(index, _next_break(decoded, index)))
+                decoded = decoded.with_legs_turned(moves.network, range(index, _next_break(decoded, index)))
     return decoded
 
 
-def _follow(chains: list[Chain], network: Network, at: int, move: Move | None, to: int) -> int:
-    """Extend the legs by one move; where the network does not lead there, begin a new one."""
+def _extend_legs(chains: list[Chain], network: Network, at: int, move: Move | None, to: int) -> int:
+    """Extend the legs by one move to the element `to`, whose number is returned; without a move begin a new leg."""
     if move is None:
         number = chains[-1].high + 1
         chains.append(Chain((to,), (0.0,), number))
@@ -338,27 +341,27 @@ def _follow(chains: list[Chain], network: Network, at: int, move: Move | None, t
     return at
 
 
-def _next_break(decoded: Decoded, index: int) -> int:
+def _next_break(decoded: LegsOfSteps, index: int) -> int:
     """The next leg that shares no element with the one before it, else the number of legs."""
     later = range(index + 1, len(decoded.chains))
     return next((number for number in later if decoded.chains[number].shared is None), len(decoded.chains))
 
 
-def _first_step(decoded: Decoded, index: int) -> int:
+def _first_step(decoded: LegsOfSteps, index: int) -> int:
     """First step of a leg."""
     return int(np.searchsorted(decoded.leg, index))
 
 
-def _heading_at(decoded: Decoded, legs: list[Leg], index: int, before: bool = False) -> float:
+def _heading_at(decoded: LegsOfSteps, legs: list[Leg], index: int, before: bool = False) -> float:
     """Heading of the track at the first step of a leg, or at the step before it [deg]."""
     step = _first_step(decoded, index) - before
     leg = legs[int(decoded.leg[step])]
-    segment, _ = segments_at(leg, positions_m(decoded, legs)[[step]])
+    segment, _ = segments_at(leg, step_positions_m(decoded, legs)[[step]])
     return float(leg.heading_deg[segment[0]])
 
 
 def _shift_over_break_m(
-    moves: Moves, course: PathCourse, decoded: Decoded, before: Leg, after: Leg, index: int
+    moves: Moves, course: PathCourse, decoded: LegsOfSteps, before: Leg, after: Leg, index: int
 ) -> float:
     """Shift of a leg beyond a break, so that path position grows by the distance in between."""
     step = _first_step(decoded, index)

@@ -1,4 +1,4 @@
-"""Finding the path shown: the one of the set with the least sum of squared residuals (DOMAIN section 2)."""
+"""Matching one solution to the network: the path shown, the epochs on it, and the route as a file (DOMAIN 2)."""
 
 from __future__ import annotations
 
@@ -8,18 +8,26 @@ import numpy as np
 import polars as pl
 
 from pipeline.stages.epochs.clock import least_belief
-from pipeline.stages.matching.claims import Possible, claims, doubtful_stretches, off_stretches
-from pipeline.stages.matching.epochs import Assignment, Fixes, Placed, Written, digit_steps, fixes_of, matched_epochs
+from pipeline.stages.matching.claims import Possible, claim_tracks, doubtful_stretches, off_network_stretches
+from pipeline.stages.matching.epochs import (
+    Assignment,
+    Fixes,
+    PlacedEpochs,
+    RecordedDigits,
+    digit_deviations_m,
+    fixes_of,
+    matched_epochs,
+)
 from pipeline.stages.matching.least_squares import (
-    Decoded,
+    LegsOfSteps,
     PathCourse,
-    aligned,
-    decode,
-    least_squares,
-    legs_of,
+    least_squares_course,
+    legs_with_positions,
     path_states,
     polarity_of_parts,
-    positions_m,
+    split_into_legs,
+    step_positions_m,
+    with_direction_kept,
 )
 from pipeline.stages.odometry import Odometry
 from pipeline.stages.odometry.polarity import grows_with, polarity
@@ -62,7 +70,7 @@ def find_path(
     network = found.network
     if not found.candidates.step.size:
         raise off_the_network(fixes, network.track, config)
-    middle = _middle_rows(fixes, found.steps)
+    middle = _epochs_of_steps(fixes, found.steps)
     states = path_states(found, fixes.height_m[middle], np.sqrt(fixes.cov_uu_m2[middle]), config)
     moves = Moves.without_odometer(network, found.steps, config)
     if odometry is not None:
@@ -72,24 +80,26 @@ def find_path(
         since_m[1:] = odometry.distance_between(at_ns[states.step[:-1]], at_ns[states.step[1:]])
         doubt_m = odometry.doubt_at_s(odometry.seconds(at_ns))
         moves = Moves(network, found.steps, counted_m, doubt_m, polarity_of_parts(network, states, since_m), config)
-    course = least_squares(states, moves)
-    decoded = aligned(moves, course, decode(course, moves))
-    legs = legs_of(moves, course, decoded)
-    at_m = positions_m(decoded, legs)
+    course = least_squares_course(states, moves)
+    decoded = with_direction_kept(moves, course, split_into_legs(course, moves))
+    legs = legs_with_positions(moves, course, decoded)
+    at_m = step_positions_m(decoded, legs)
     if not grows_with(at_m, found.steps.t_ns[course.step], odometry, config.orientation_distance_m):
-        decoded = decoded.turned(network, range(len(decoded.chains)))
-        legs = legs_of(moves, course, decoded)
-        at_m = positions_m(decoded, legs)
-    return TravelledPath(network.track, tuple(legs)), _assign(fixes, found.steps, course, decoded, at_m)
+        decoded = decoded.with_legs_turned(network, range(len(decoded.chains)))
+        legs = legs_with_positions(moves, course, decoded)
+        at_m = step_positions_m(decoded, legs)
+    return TravelledPath(network.track, tuple(legs)), _assign_epochs(fixes, found.steps, course, decoded, at_m)
 
 
-def _middle_rows(fixes: Fixes, steps: PathSteps) -> Ints:
+def _epochs_of_steps(fixes: Fixes, steps: PathSteps) -> Ints:
     """The epoch with a position in the middle of each step."""
     rows = np.flatnonzero(fixes.valid)
     return np.asarray(rows[np.minimum(np.searchsorted(fixes.t_ns[rows], steps.t_ns), rows.size - 1)])
 
 
-def _assign(fixes: Fixes, steps: PathSteps, course: PathCourse, decoded: Decoded, at_m: Floats) -> Assignment:
+def _assign_epochs(
+    fixes: Fixes, steps: PathSteps, course: PathCourse, decoded: LegsOfSteps, at_m: Floats
+) -> Assignment:
     """Every epoch by the step that it is in, or the one before it: its place moved on towards the next step.
 
     Between the steps of two legs an epoch belongs to the later one.
@@ -133,24 +143,24 @@ def off_the_network(fixes: Fixes, track: SurveyedTrack, config: MatchingConfig) 
     return InputError(
         "all positions of the run are off the track",
         place="gnss: columns latitude_deg, longitude_deg",
-        found=f"positions {_length(float(nearest_m[row]))} or more from any track, nearest at "
+        found=f"positions {_length_words(float(nearest_m[row]))} or more from any track, nearest at "
         f"{latitude:.5f}, {longitude:.5f} (track at {track.latitude_deg[at]:.5f}, {track.longitude_deg[at]:.5f})",
         expected=f"positions within {config.reach_m:g} m of a net element",
         remedy=remedy,
     )
 
 
-def _length(metres: float) -> str:
+def _length_words(metres: float) -> str:
     """A length for people, in km from 10 km on."""
     return f"{metres / 1000:.0f} km" if metres >= 10_000 else f"{metres:.0f} m"
 
 
 @frozen
 class Match:
-    """Epochs on the path, the path, when it was in doubt, and when the positions were `off` the network.
+    """Epochs on the path, the path, stretches in which it was in doubt, and those `off` the network.
 
-    `possible`: elements that no position refutes, in hindsight. `odometer_sign`: of the recorded odometer
-    against growing path, set here and nowhere else.
+    `possible`: elements that no position refutes, in hindsight. `odometer_sign`: of the recorded odometer against
+    growing path, set here and nowhere else.
     """
 
     epochs: MatchedEpochs
@@ -207,14 +217,14 @@ def match(
     )
     found = path_set(steps, network, config)
     path, assignment = find_path(arrays, odometry, found, config)
-    placed = Placed.on(arrays, path, assignment)
-    element = elements_of(arrays, path, assignment, placed)
+    placed = PlacedEpochs.on_path(arrays, path, assignment)
+    element = elements_of_epochs(arrays, path, assignment, placed)
     # The set counts from the first position, not from the first epoch.
     since_s = (arrays.t_ns - arrays.t_ns[rows[0]]) / NS_PER_S
-    claimed = claims(found, since_s, element, np.sqrt(0.5 * (arrays.cov_ee_m2 + arrays.cov_nn_m2)), config)
+    claimed = claim_tracks(found, since_s, element, np.sqrt(0.5 * (arrays.cov_ee_m2 + arrays.cov_nn_m2)), config)
     assignment = replace(assignment, path_probability=claimed.hindsight, gate_probability=claimed.live)
     ambiguous = doubtful_stretches(claimed, arrays.t_ns, element, read_element >= 0, network)
-    written = Written(str(fixes["solution"][0]), *digit_steps(fixes, fix_sigma.digits_least_m))
+    written = RecordedDigits(str(fixes["solution"][0]), *digit_deviations_m(fixes, fix_sigma.digits_least_m))
     epochs = matched_epochs(arrays, written, path, assignment, placed, vehicle, config)
     sign = _odometer_sign(odometry, epochs, config)
     if sign < 0 and vehicle.gnss_antenna_ahead_m:
@@ -222,18 +232,18 @@ def match(
         # antenna stays where it is on the train.
         vehicle = vehicle.model_copy(update={"gnss_antenna_ahead_m": -vehicle.gnss_antenna_ahead_m})
         epochs = matched_epochs(arrays, written, path, assignment, placed, vehicle, config)
-    off = off_stretches(claimed, epochs, config.paths_level_s)
+    off = off_network_stretches(claimed, epochs, config.paths_level_s)
     return Match(epochs, path, ambiguous, off, claimed.possible, sign)
 
 
-def elements_of(fixes: Fixes, path: TravelledPath, assignment: Assignment, placed: Placed) -> Ints:
+def elements_of_epochs(fixes: Fixes, path: TravelledPath, assignment: Assignment, placed: PlacedEpochs) -> Ints:
     """The net element of each epoch on the path, -1 without a position."""
     element, _ = path.locate_index(assignment.leg, placed.antenna_m)
     return np.where(fixes.valid & np.isfinite(placed.antenna_m), element, -1)
 
 
 def _read_elements_of_positions(read_element: Ints, rows: Ints) -> Ints:
-    """The element of each read at the position that it belongs to: the last one not after its epoch."""
+    """Per position the element of the balise read since, -1 for none; a read belongs to the last one before it."""
     of_position = np.full(rows.size, -1, dtype=np.int64)
     read = np.flatnonzero(read_element >= 0)
     of_position[np.maximum(np.searchsorted(rows, read, side="right") - 1, 0)] = read_element[read]
@@ -241,7 +251,7 @@ def _read_elements_of_positions(read_element: Ints, rows: Ints) -> Ints:
 
 
 def _odometer_sign(odometry: Odometry | None, epochs: MatchedEpochs, config: MatchingConfig) -> int:
-    """+1 or -1: the odometer's sign against growing path (DOMAIN section 2); +1 without one."""
+    """The odometer's sign against growing path (DOMAIN section 2): +1 or -1, +1 without an odometer."""
     if odometry is None:
         return 1
     path_m = np.where(epochs.fix_valid & epochs.on_track, epochs.path_m, np.nan)
@@ -288,15 +298,18 @@ def travelled_route(match: Match) -> pl.DataFrame:
     """
     leg = match.epochs.leg
     rows = [
-        _row(match, number, one, visits, leg == number)
+        _route_row(match, number, one, visits, leg == number)
         for number, one in enumerate(match.path.legs)
-        for visits in _passages(match.path.track, one)
+        for visits in _visits_by_passage(match.path.track, one)
     ]
     return pl.DataFrame(rows, schema=ROUTE_COLUMNS, orient="row")
 
 
-def _passages(track: SurveyedTrack, leg: Leg) -> list[list[int]]:
-    """Visits that are one passage of an element: its pieces, one after the other. Each circuit of a ring is another."""
+def _visits_by_passage(track: SurveyedTrack, leg: Leg) -> list[list[int]]:
+    """Numbers of the visits of each passage of an element: its pieces, one after the other.
+
+    Each circuit of a ring is another passage.
+    """
     passages: list[list[int]] = []
     ended: object = None
     for number, visit in enumerate(leg.visits):
@@ -310,7 +323,7 @@ def _passages(track: SurveyedTrack, leg: Leg) -> list[list[int]]:
     return passages
 
 
-def _row(match: Match, number: int, leg: Leg, visits: list[int], on_leg: Bools) -> tuple[object, ...]:
+def _route_row(match: Match, number: int, leg: Leg, visits: list[int], on_leg: Bools) -> tuple[object, ...]:
     """One row of `ROUTE_COLUMNS`: a passage of a net element on the leg of this number."""
     path_m = match.epochs.path_m
     segment, _ = segments_at(leg, np.nan_to_num(path_m))
@@ -327,25 +340,25 @@ def _row(match: Match, number: int, leg: Leg, visits: list[int], on_leg: Bools) 
         least is None or least < ONE_TRACK_LEFT,
         epochs["gate_probability"].min(),
         epochs["path_probability"].min(),
-        _rivals(match, inside, 1.0 - ONE_TRACK_LEFT),
+        _rival_words(match, inside, 1.0 - ONE_TRACK_LEFT),
         float(np.median(match.epochs.cross_track_m[inside])) if len(inside) else None,
         times[int(inside[0])] if len(inside) else None,
         times[int(inside[-1])] if len(inside) else None,
     )
 
 
-def _rivals(match: Match, rows: Ints, least: float) -> str:
-    """Elements off the path that are possible at some of these epochs."""
+def _rival_words(match: Match, rows: Ints, least: float) -> str:
+    """Elements off the path that were possible at some of these epochs, with their probability, in words."""
     if len(rows) == 0:
         return ""
-    highest = _highest(match.possible, int(rows[0]), int(rows[-1]))
+    highest = _highest_confidences(match.possible, int(rows[0]), int(rows[-1]))
     ids = match.path.track.ids
     on_path = set(match.path.elements())
     order = sorted((-probability, ids[element]) for element, probability in highest.items())
     return "; ".join(f"{name} {-value:.3f}" for value, name in order if -value > least and name not in on_path)
 
 
-def _highest(possible: Possible, first: int, last: int) -> dict[int, float]:
+def _highest_confidences(possible: Possible, first: int, last: int) -> dict[int, float]:
     """The highest confidence in each element at the steps from one epoch to another."""
     begin, end = np.searchsorted(possible.epoch, [first, last + 1])
     part = slice(int(possible.first[max(int(begin) - 1, 0)]), int(possible.first[int(end)]))

@@ -60,7 +60,7 @@ class AxisBank:
         self.threshold = np.full(shape, np.nan, order="F")
         self.noise_m = np.full(shape, np.nan, order="F")
         self.state = np.full(shape, NOT_EVALUATED, dtype=np.int8, order="F")
-        self.begins = np.zeros(epochs, dtype=np.bool_)
+        self.window_begins = np.zeros(epochs, dtype=np.bool_)
         # Rows of the odometer scatter by nobody knows how much yet.
         self.noise_known: Bools = axis.reasons != NUMBER[NOISE_UNKNOWN]
         given_m: tuple[float, ...] | None = getattr(config.monitors, f"noise_{axis.name}_m")
@@ -101,7 +101,7 @@ class AxisBank:
         self.value[part.epoch] = np.where(present, value, np.nan)
         self.threshold[part.epoch] = np.where(judged, threshold, np.nan)
         self.noise_m[part.epoch] = noise_m
-        self.begins[part.epoch] = part.fresh
+        self.window_begins[part.epoch] = part.fresh
         self.noise_known[part.epoch] = known
 
     def freeze(self, epoch: int) -> None:
@@ -186,7 +186,7 @@ class MonitorBank:
         )
         along, across, _ = self._axes
         # In a run without an odometer the axis across the track has to say where the bank begins.
-        self._begins = (along if along.series.epoch.size else across).begins
+        self._begins = (along if along.series.epoch.size else across).window_begins
         self._noise_known = along.noise_known
         self.watched: Ints = along.series.epoch
         self._single = {

@@ -38,16 +38,16 @@ class Segments(Polyline):
     length_m: Floats
     distance_along_m: Floats
 
-    def search(self, box: Box | None = None) -> Search:
+    def search_in(self, box: Box | None = None) -> SegmentSearch:
         """The search over all segments, or those in a box: a run needs only the part of a network about it."""
         from scipy.spatial import cKDTree  # takes long to load, and a log needs none
 
         rows = np.arange(len(self)) if box is None else box.touched_by(self.start, self.end)
-        probes, segment = self._probes(rows)
-        return Search(self, cKDTree(probes, balanced_tree=False, compact_nodes=False), segment)
+        probes, segment = self._search_points(rows)
+        return SegmentSearch(self, cKDTree(probes, balanced_tree=False, compact_nodes=False), segment)
 
-    def _probes(self, rows: Ints) -> tuple[Floats, Ints]:
-        """Search points on some segments: along long ones several, along runs of short ones only some."""
+    def _search_points(self, rows: Ints) -> tuple[Floats, Ints]:
+        """Search points on some segments, and the segment of each: several on long ones, few on runs of short ones."""
         # Whether one is needed depends on the segment before.
         some = np.union1d(rows, np.maximum(rows - 1, 0))
         pieces = np.maximum(1, np.ceil(self.length_m[some] / (0.25 * PROBE_SPACING_M))).astype(np.int64)
@@ -67,8 +67,8 @@ class Segments(Polyline):
 
 
 @frozen
-class Search:
-    """A search tree over probes, and the segment of each."""
+class SegmentSearch:
+    """A search tree over points on segments, and the segment of each point."""
 
     segments: Segments
     tree: cKDTree
@@ -77,11 +77,11 @@ class Search:
 
 @frozen
 class Candidates:
-    """Candidates in order of step, then element; `first[k] : first[k + 1]` are those of step k.
+    """Places on net elements within reach, by step, then element; `first[k] : first[k + 1]` are those of step k.
 
     `along_m` from the element's start and `left_m` to its end; `beyond_m` how far the position lies past the end that
-    `past` names (-1 start, 1 end, 0 neither); `offset_m` left of its own sense; `height_m` of the track (NaN
-    on a 2-D survey); `vertex` at which the segment begins; `linked_start`, `linked_end`: a relation leads on there.
+    `past` names (-1 start, 1 end, 0 neither); `offset_m` left of its own sense; `height_m` of the track (NaN on a 2-D
+    survey); `vertex` at which the segment begins; `linked_start`, `linked_end`: a relation leads on there.
     """
 
     first: Ints
@@ -99,7 +99,7 @@ class Candidates:
     linked_start: Bools
     linked_end: Bools
 
-    def of(self, element: int, begin: int, end: int) -> Ints:
+    def rows_of(self, element: int, begin: int, end: int) -> Ints:
         """Rows of an element at the steps from `begin` on, before `end`, in their order."""
         order, first = self._by_element
         rows = order[first[element] : first[element + 1]] if element + 1 < first.size else order[:0]
@@ -108,18 +108,18 @@ class Candidates:
 
     @cached_property
     def _by_element(self) -> tuple[Ints, Ints]:
-        """Candidates in order of net element and step, and where each net element begins."""
+        """Rows in order of net element and step, and where each net element begins among them."""
         order = np.lexsort((self.step, self.element))
         most = int(self.element.max(initial=-1))
         return order, np.searchsorted(self.element[order], np.arange(most + 2))
 
     def take(self, rows: Ints, steps: int) -> Candidates:
-        """Some of the candidates, in the same order."""
+        """Some of the candidates, in the same order; `steps`: how many steps there are."""
         step = self.step[rows]
         columns = {name: getattr(self, name)[rows] for name in _COLUMNS}
         return Candidates(first=np.searchsorted(step, np.arange(steps + 1)), **columns)
 
-    def renumbered(self, kept: Bools) -> Candidates:
+    def with_steps_renumbered(self, kept: Bools) -> Candidates:
         """The candidates with steps counted among the kept ones only; the others have no candidates."""
         number = np.cumsum(kept) - 1
         step = number[self.step]
@@ -131,7 +131,7 @@ _COLUMNS = tuple(column.name for column in fields(Candidates) if column.name != 
 
 @Once
 def segments_of(track: SurveyedTrack) -> Segments:
-    """Segments of all elements."""
+    """Segments of all elements of a track."""
     owner = np.repeat(np.arange(len(track.ids)), np.diff(track.first))
     # A segment begins at each vertex but the last of an element.
     head = np.flatnonzero(owner[:-1] == owner[1:])
@@ -142,12 +142,12 @@ def segments_of(track: SurveyedTrack) -> Segments:
     return Segments(start, end, owner[head], first, head, length_m, np.cumsum(length_m))
 
 
-def search_about(places: Floats, network: Network, reach_m: float) -> Search:
-    """The search for candidates about these places, up to a reach [m]."""
-    return segments_of(network.track).search(box_about(places, reach_m + PROBE_SPACING_M))
+def search_about(places: Floats, network: Network, reach_m: float) -> SegmentSearch:
+    """A search over the segments within a reach [m] of these places."""
+    return segments_of(network.track).search_in(box_about(places, reach_m + PROBE_SPACING_M))
 
 
-def candidates_of(points: Points, network: Network, search: Search, reach_m: float) -> Candidates:
+def candidates_of(points: Points, network: Network, search: SegmentSearch, reach_m: float) -> Candidates:
     """The nearest place on each element within reach of every point.
 
     Args:
@@ -175,16 +175,16 @@ def candidates_of(points: Points, network: Network, search: Search, reach_m: flo
     fresh[1:] = (step[1:] != step[:-1]) | (element[1:] != element[:-1])
     feet = downhill(points.take(step[fresh]), segments, segment[fresh], segments.element)
     near = np.flatnonzero(feet.distance_m <= reach_m)
-    return _candidates(len(points), network, segments, step[fresh][near], feet.take(near))
+    return _candidates_at_feet(len(points), network, segments, step[fresh][near], feet.take(near))
 
 
-def overtaken(candidates: Candidates, network: Network) -> Bools:
+def belong_beyond(candidates: Candidates, network: Network) -> Bools:
     """Candidates near an end of their element whose position belongs to the next element beyond that end.
 
     So a position has one place on a line, however many elements this is cut into: on the element that it lies farther
     inside of, as at a bend it may lie past the ends of both, or inside both.
     """
-    past_m = _past_ends_m(candidates)
+    past_m = _distances_past_ends_m(candidates)
     row, end = np.nonzero(np.isfinite(past_m))
     edge_first = network.successors.first
     edge_to = network.successors.to
@@ -214,7 +214,7 @@ def overtaken(candidates: Candidates, network: Network) -> Bools:
         out = now
 
 
-def _past_ends_m(candidates: Candidates) -> Floats:
+def _distances_past_ends_m(candidates: Candidates) -> Floats:
     """How far each candidate lies past its element's start and end [m], negative inside, infinite if not near."""
     columns = []
     for past, inside_m in ((-1, candidates.along_m), (1, candidates.left_m)):
@@ -223,7 +223,7 @@ def _past_ends_m(candidates: Candidates) -> Floats:
     return np.column_stack(columns)
 
 
-def merged(some: Candidates, added: Candidates, step_of_added: Ints) -> Candidates:
+def merge_candidates(some: Candidates, added: Candidates, step_of_added: Ints) -> Candidates:
     """Candidates of two searches together; the steps of the second are numbered anew."""
     steps = len(some.first) - 1
     added = replace(added, step=step_of_added[added.step])
@@ -233,7 +233,7 @@ def merged(some: Candidates, added: Candidates, step_of_added: Ints) -> Candidat
     return Candidates(first=np.searchsorted(columns["step"], np.arange(steps + 1)), **columns)
 
 
-def _candidates(points: int, network: Network, segments: Segments, step: Ints, feet: Feet) -> Candidates:
+def _candidates_at_feet(points: int, network: Network, segments: Segments, step: Ints, feet: Feet) -> Candidates:
     """Feet on segments as places on net elements, one row each; `step`: the point that each foot belongs to."""
     segment = feet.segment
     element = segments.element[segment]
@@ -268,7 +268,7 @@ def _candidates(points: int, network: Network, segments: Segments, step: Ints, f
 
 
 def _headings_rad(track: SurveyedTrack, vertex: Ints) -> Floats:
-    """Heading of the segments that begin at these vertices, clockwise from north."""
+    """Heading of the segments that begin at these vertices, clockwise from north [rad]."""
     # Steps share vertices: each heading once.
     some, which = np.unique(vertex, return_inverse=True)
     places = points_of(track.latitude_deg[some], track.longitude_deg[some])

@@ -9,8 +9,8 @@ from functools import cached_property
 
 import numpy as np
 
-from pipeline.stages.paths.candidates import Candidates, Search, candidates_of, search_about
-from pipeline.stages.paths.path_set import Left, Node, PathSet, ResidualsBefore, ReturnSearch
+from pipeline.stages.paths.candidates import Candidates, SegmentSearch, candidates_of, search_about
+from pipeline.stages.paths.path_set import Node, PathSet, RefutedPath, ResidualsBefore, ReturnSearch
 from pipeline.stages.paths.path_steps import PathSteps
 from pipeline.stages.paths.path_tests import LOOKED_S, WINDOWS_S, PathTests, Stretch, Totals, Trail
 from pipeline.stages.track.network import Network
@@ -21,7 +21,9 @@ from schemas.config import MatchingConfig
 _SURELY_ALIKE = 1.0 - 1e-9
 
 
-def path_set(steps: PathSteps, network: Network, config: MatchingConfig, search: Search | None = None) -> PathSet:
+def path_set(
+    steps: PathSteps, network: Network, config: MatchingConfig, search: SegmentSearch | None = None
+) -> PathSet:
     """Every path that begins near the first positions and goes on over navigable relations, until it is refuted.
 
     Args:
@@ -47,12 +49,12 @@ def path_set(steps: PathSteps, network: Network, config: MatchingConfig, search:
     others = candidates.step[lines != lines[:1]]
     alone = int(others[0]) if others.size else len(steps)
     tests = PathTests.of_run(steps, alone, config)
-    return _Growth(steps, network, tests, candidates, survey_m, groups, config).grown()
+    return _Growth(steps, network, tests, candidates, survey_m, groups, config).grow_all()
 
 
 @dataclass
 class _Growth:
-    """The paths while they grow, the earliest step first."""
+    """The paths of a run while they grow; those that begin first are followed first."""
 
     steps: PathSteps
     network: Network
@@ -71,22 +73,25 @@ class _Growth:
         self._unclaimed = np.zeros(len(self.steps), dtype=np.bool_)
         self._returned: list[int] = []
 
-    def grown(self) -> PathSet:
-        """Follow the hypothesis that begins first until none is left; begin anew where all are refuted."""
+    def grow_all(self) -> PathSet:
+        """Follow the hypothesis that begins first until none is left; begin anew where all are refuted.
+
+        The set of all.
+        """
         count = len(self.steps)
         overflow = count
-        start = self._begin(0)
+        start = self._next_first_step(0)
         while start < count:
             first = len(self._made)
-            self._push_all(start)
+            self._begin_paths(start)
             while self._queue:
                 _, _, node = heapq.heappop(self._queue)
-                if self._too_many(node):
+                if self._exceeds_limit(node):
                     overflow = min(overflow, node.begin)
                     self._queue.clear()
                     break
-                for child in self._follow(node):
-                    self._push(child)
+                for child in self._follow_element(node):
+                    self._enqueue(child)
             start = count if overflow < count else self._restart_step(self._made[first:])
         self._unclaimed[overflow:] = True
         return PathSet(
@@ -101,8 +106,8 @@ class _Growth:
             self.config.paths_anew_s,
         )
 
-    def _too_many(self, node: Node) -> bool:
-        """More hypotheses have begun of late than are followed."""
+    def _exceeds_limit(self, node: Node) -> bool:
+        """Whether more hypotheses have begun in the last ten minutes than are followed."""
         now_s = float(self.steps.end_s[node.begin])
         self._begun_s.append(now_s)
         while self._begun_s[0] < now_s - LOOKED_S:
@@ -123,11 +128,11 @@ class _Growth:
         last = max(refuted, key=lambda node: node.rejected)
         died = last.rejected
         if self.steps.end_s[died] - self.steps.begin_s[self._made[0].begin] <= self.config.paths_anew_s:
-            begin = self._begin(died + 1)
+            begin = self._next_first_step(died + 1)
             since_s = self.steps.end_s - self.steps.end_s[min(begin, count - 1)]
             self._unclaimed |= (since_s >= 0.0) & (since_s < self.config.paths_anew_s)
             return begin
-        self._returned.append(self._begin(self._return_step(last, died)))
+        self._returned.append(self._next_first_step(self._return_step(last, died)))
         return self._returned[-1]
 
     def _return_step(self, node: Node, died: int) -> int:
@@ -141,43 +146,45 @@ class _Growth:
         before = np.isfinite(residual_m) & steps.counted[first:last]
         if not before.any():
             return len(steps)
-        left = Left(node.oriented, died, float(np.mean(residual_m[before])), float(np.median(node.along.survey_m)))
-        return ReturnSearch(steps, self.network, self.candidates, self.tests, self.config).after(left)
+        left = RefutedPath(
+            node.oriented, died, float(np.mean(residual_m[before])), float(np.median(node.along.survey_m))
+        )
+        return ReturnSearch(steps, self.network, self.candidates, self.tests, self.config).first_return(left)
 
-    def _begin(self, step: int) -> int:
-        """The first step from this one on with an element that its offset does not refute, else the number of steps."""
+    def _next_first_step(self, step: int) -> int:
+        """The first step from this one on at which a path may begin, else the number of steps."""
         after = self._first_steps[np.searchsorted(self._first_steps, step) :]
         return int(after[0]) if after.size else len(self.steps)
 
     @cached_property
-    def _near(self) -> Bools:
+    def _may_begin_at(self) -> Bools:
         """Candidates that a path may begin with: as near as the test of the offset allows."""
         candidates = self.candidates
-        limit_m = self.tests.offset_m(self.steps.sigma_m[candidates.step], self.survey_m, self._track_spacing_m)
+        limit_m = self.tests.offset_limit_m(self.steps.sigma_m[candidates.step], self.survey_m, self._track_spacing_m)
         near: Bools = (np.abs(candidates.offset_m) <= limit_m) & (
-            self._inside(np.arange(len(candidates.step))) | (candidates.beyond_m <= self.config.paths_end_m)
+            self._are_on_element(np.arange(len(candidates.step))) | (candidates.beyond_m <= self.config.paths_end_m)
         )
         return near
 
-    def _stretch(self, oriented: int, rows: Ints) -> Stretch:
+    def _stretch_at(self, oriented: int, rows: Ints) -> Stretch:
         """The stretch of an oriented element at its candidates."""
         candidates = self.candidates
         turned = oriented % 2
         return Stretch(
             (1.0 - 2.0 * turned) * candidates.offset_m[rows],
             self.survey_m[rows],
-            self._sides_m[turned][rows],
-            self._sides_m[1 - turned][rows],
+            self._distances_aside_m[turned][rows],
+            self._distances_aside_m[1 - turned][rows],
             candidates.heading_rad[rows] + np.pi * turned,
         )
 
     @cached_property
     def _track_spacing_m(self) -> Floats:
         """Distance from each candidate to the nearest track on the side of the position [m], 0 without one."""
-        return np.where(self.candidates.offset_m > 0.0, *self._sides_m)
+        return np.where(self.candidates.offset_m > 0.0, *self._distances_aside_m)
 
     @cached_property
-    def _sides_m(self) -> tuple[Floats, Floats]:
+    def _distances_aside_m(self) -> tuple[Floats, Floats]:
         """Distance of the nearest other track to the left and right of each candidate, in its sense [m], 0 without one.
 
         The tracks of a step in the order in which they lie side by side, but for those that end before it.
@@ -199,21 +206,21 @@ class _Growth:
     @cached_property
     def _first_steps(self) -> Ints:
         """Steps at which a path may begin."""
-        return np.unique(self.candidates.step[self._near])
+        return np.unique(self.candidates.step[self._may_begin_at])
 
-    def _push_all(self, step: int) -> None:
-        """Begin with every element near a step."""
+    def _begin_paths(self, step: int) -> None:
+        """Queue a hypothesis on every element near a step."""
         rows = np.arange(int(self.candidates.first[step]), int(self.candidates.first[step + 1]))
-        for row in rows[self._near[rows]].tolist():
-            self._push(Node(2 * int(self.candidates.element[row]), step, stretch=step))
+        for row in rows[self._may_begin_at[rows]].tolist():
+            self._enqueue(Node(2 * int(self.candidates.element[row]), step, stretch=step))
 
-    def _push(self, node: Node) -> None:
+    def _enqueue(self, node: Node) -> None:
         """Queue a new hypothesis, unless it is like one on the same element: then that one stands for both."""
         same = self._by_element.setdefault(node.oriented, [])
         before = ResidualsBefore(node, self.steps)
         for other in same:
             covers = other.begin <= node.begin and (not other.followed or other.end > node.begin)
-            if covers and other.rejected >= node.rejected and self._alike(other, before):
+            if covers and other.rejected >= node.rejected and self._are_alike(other, before):
                 # Their tests cannot differ by more than the bounds allow for (rule 8).
                 other.p = max(other.p, node.p)
                 later = other.p_by_step[1 + node.begin - other.begin :]
@@ -225,38 +232,41 @@ class _Growth:
         self._made.append(node)
         heapq.heappush(self._queue, (node.begin, len(self._made), node))
 
-    def _alike(self, one: Node, new: ResidualsBefore) -> bool:
-        """Two paths to one element that no test can tell apart by more than it allows for, whatever comes (rule 8).
+    def _are_alike(self, one: Node, new: ResidualsBefore) -> bool:
+        """Whether no test can tell two paths to one element apart by more than it allows for, whatever comes (rule 8).
 
         Their means agree over every window that a later test may still look at, and over their whole length.
         """
         other = new.node
         last, alike_m = other.begin, self.config.paths_alike_m
-        first = int(new.begins[-1])
+        first = int(new.window_begins[-1])
         one_m, other_m = one.residuals_m(first, last), new.residual_m
         if (np.isfinite(one_m) != np.isfinite(other_m)).any():
             return False
         apart_m = np.where(self.steps.counted[first:last], np.nan_to_num(one_m - other_m), 0.0)
-        for window_s, begin in zip(WINDOWS_S, new.begins.tolist(), strict=True):
+        for window_s, begin in zip(WINDOWS_S, new.window_begins.tolist(), strict=True):
             part_m = apart_m[begin - first :]
             # No mean is larger than the largest difference: most pairs need none.
             doubtful = np.abs(part_m).max(initial=0.0) > _SURELY_ALIKE * alike_m
-            if doubtful and self.tests.farthest_m(self.steps, part_m, last, window_s) > alike_m:
+            if doubtful and self.tests.largest_window_mean_m(self.steps, part_m, last, window_s) > alike_m:
                 return False
-        own = self.tests.totals(self.steps, one.begin, one.along.upto(last - one.begin))
+        own = self.tests.sum_steps(self.steps, one.begin, one.along.first_steps(last - one.begin))
         sums = one.before.residual_m + own.residual_m, other.before.residual_m
         return abs(sums[0] - sums[1]) <= alike_m * max(one.before.number + own.number, 1.0)
 
-    def _follow(self, node: Node) -> list[Node]:
-        """Along its element up to where it leaves it or is refuted for long enough; returns what it goes on as."""
+    def _follow_element(self, node: Node) -> list[Node]:
+        """Follow a hypothesis along its element until it leaves it or is refuted for long.
+
+        The hypotheses it goes on as.
+        """
         candidates = self.candidates
         count = len(self.steps)
-        rows = candidates.of(node.element, node.begin, count)
+        rows = candidates.rows_of(node.element, node.begin, count)
         step = candidates.step[rows]
         # Steps without a pause or a candidate missing among them, and inside the element.
         run = np.arange(node.begin, node.begin + rows.size) == step
         run &= ~self._gap[np.minimum(step, count - 1)] | (step == node.begin)
-        inside = self._inside(rows)
+        inside = self._are_on_element(rows)
         # Not yet on it, by the noise along the track or of an offset at a bend: it came in over that end.
         near = inside | (candidates.beyond_m[rows] <= self.config.paths_end_m)
         late = np.logical_and.accumulate(near) & ~np.logical_or.accumulate(inside)
@@ -266,11 +276,11 @@ class _Growth:
         node.followed = True
         node.end = node.begin + stays
         if stays:
-            node.along = self._stretch(node.oriented, rows)
+            node.along = self._stretch_at(node.oriented, rows)
             node.left_m = np.column_stack([candidates.along_m[rows], candidates.left_m[rows]])
             node.barred = min(node.barred, self._contradicted_step(node))
             node.rejected = min(node.rejected, node.barred)
-            verdict = self.tests.of(self.steps, self._trail(node))
+            verdict = self.tests.test_trail(self.steps, self._trail_of(node))
             node.p_by_step = np.minimum(node.p, np.concatenate([np.ones(1), verdict.p]))
             node.p = float(node.p_by_step[-1])
             node.rejected = min(node.rejected, verdict.rejected)
@@ -279,15 +289,15 @@ class _Growth:
             known = int(np.searchsorted(self.steps.end_s, self.steps.end_s[node.rejected] + self.config.paths_delay_s))
             node.end = min(node.end, known + 1)
             if node.end <= known and node.end < count:
-                return self._onward(node)
+                return self._next_hypotheses(node)
             return []
-        return self._onward(node) if node.end < count else []
+        return self._next_hypotheses(node) if node.end < count else []
 
-    def _trail(self, node: Node) -> Trail:
-        """Its path as far back as any test looks."""
+    def _trail_of(self, node: Node) -> Trail:
+        """The path of a hypothesis as far back as any test looks."""
         end_s = self.steps.end_s
-        chain = node.since(int(np.searchsorted(end_s, end_s[node.begin] - self.tests.longest_s)))
-        along = Stretch.joined([one.along for one in chain])
+        chain = node.chain_since(int(np.searchsorted(end_s, end_s[node.begin] - self.tests.longest_s)))
+        along = Stretch.joined_parts([one.along for one in chain])
         return Trail(node.stretch, chain[0].begin, node.begin, along, node.before)
 
     def _contradicted_step(self, node: Node) -> int:
@@ -295,17 +305,17 @@ class _Growth:
         for step in (node.begin + np.flatnonzero(self.steps.read_element[node.begin : node.end] >= 0)).tolist():
             # A read belongs to the step after it: in the meantime the train went on.
             limit_m = (1.0 + self.config.detour_share) * float(self.steps.distance_m[step]) + self.config.paths_end_m
-            if not self._within(node.element, int(self.steps.read_element[step]), limit_m):
+            if not self._is_within_reach(node.element, int(self.steps.read_element[step]), limit_m):
                 return int(step)
         return 2**62
 
-    def _within(self, one: int, other: int, limit_m: float) -> bool:
-        """Two elements are the same, or not so far apart along the network."""
+    def _is_within_reach(self, one: int, other: int, limit_m: float) -> bool:
+        """Whether two elements are the same, or no more than `limit_m` apart along the network."""
         reached = (self.network.reach(2 * one + side, limit_m).get(2 * other + to) for side in (0, 1) for to in (0, 1))
         return one == other or any(reach is not None and reach.distance_m <= limit_m for reach in reached)
 
-    def _inside(self, rows: Ints) -> Bools:
-        """Places on the element; past an open end as far as the noise may lead."""
+    def _are_on_element(self, rows: Ints) -> Bools:
+        """Candidates that lie on their element; past an open end as far as the noise may lead."""
         candidates = self.candidates
         past = candidates.past[rows]
         linked = np.where(past < 0, candidates.linked_start[rows], candidates.linked_end[rows])
@@ -314,14 +324,14 @@ class _Growth:
         inside: Bools = (past == 0) | (~linked & near)
         return inside
 
-    def _onward(self, node: Node) -> list[Node]:
-        """What the path may go on as at the first step that is not on its element any more."""
+    def _next_hypotheses(self, node: Node) -> list[Node]:
+        """The hypotheses that a path goes on as, at the first step that is not on its element any more."""
         step = node.end
         if step >= len(self.steps):
             return []
         candidates = self.candidates
         rows = np.arange(int(candidates.first[step]), int(candidates.first[step + 1]))
-        inside = rows[self._inside(rows) | (candidates.beyond_m[rows] <= self.config.paths_end_m)]
+        inside = rows[self._are_on_element(rows) | (candidates.beyond_m[rows] <= self.config.paths_end_m)]
         limit_m = (1.0 + self.config.detour_share) * float(self.steps.distance_m[step]) + self.config.detour_m
         reached: dict[int, int] = {}
         for leaving in (node.oriented, node.oriented ^ 1):
@@ -330,18 +340,21 @@ class _Growth:
                 if allowed and reach.distance_m <= limit_m:
                     reached.setdefault(to // 2, to if leaving == node.oriented else to ^ 1)
         children = [
-            self._child(node, reached[int(candidates.element[row])], step)
+            self._child_of(node, reached[int(candidates.element[row])], step)
             for row in inside.tolist()
             if int(candidates.element[row]) in reached and int(candidates.element[row]) != node.element
         ]
         own = [row for row in rows.tolist() if int(candidates.element[row]) == node.element]
-        if own and (not children or self._inside(np.array(own))[0]):
+        if own and (not children or self._are_on_element(np.array(own))[0]):
             # Between two elements, or over a pause on the same one: it stays.
-            children.append(self._child(node, node.oriented, step))
-        return self._kept(node, children, step)
+            children.append(self._child_of(node, node.oriented, step))
+        return self._without_idle_child(node, children, step)
 
-    def _kept(self, node: Node, children: list[Node], step: int) -> list[Node]:
-        """A child that only stays on the element past its end would be asked again at every step: it waits there."""
+    def _without_idle_child(self, node: Node, children: list[Node], step: int) -> list[Node]:
+        """The next hypotheses; where the only one stays on the element past its end, the path itself waits there.
+
+        It would be asked again at every step.
+        """
         candidates = self.candidates
         if not children:
             node.rejected = min(node.rejected, step)
@@ -354,23 +367,23 @@ class _Growth:
                 node.rejected = min(node.rejected, step)
                 return []
             child = children[0]
-            if not self._inside(np.array([row]))[0]:
-                own = self._stretch(node.oriented, np.array([row]))
+            if not self._are_on_element(np.array([row]))[0]:
+                own = self._stretch_at(node.oriented, np.array([row]))
                 # It leaves the bias where it was.
                 own = own._replace(
                     heading_rad=node.along.heading_rad[-1:] if node.along.heading_rad.size else np.zeros(1)
                 )
-                node.along = Stretch.joined([node.along, own])
+                node.along = Stretch.joined_parts([node.along, own])
                 node.p_by_step = np.append(node.p_by_step, node.p)
                 node.left_m = np.vstack([node.left_m, [candidates.along_m[row], candidates.left_m[row]]])
                 node.end = step + 1
-                child = self._child(node, node.oriented, step + 1)
+                child = self._child_of(node, node.oriented, step + 1)
                 return [child] if child.begin < len(self.steps) else []
         return children
 
-    def _child(self, node: Node, oriented: int, step: int) -> Node:
+    def _child_of(self, node: Node, oriented: int, step: int) -> Node:
         """The hypothesis on the next element from a step on, with the sums of its whole path before it."""
-        own = self.tests.totals(self.steps, node.begin, node.along)
+        own = self.tests.sum_steps(self.steps, node.begin, node.along)
         before = Totals(*(one + other for one, other in zip(node.before, own, strict=True)))
         child = Node(oriented, step, node.stretch, node, before, node.p)
         child.rejected, child.barred = node.rejected, node.barred

@@ -58,8 +58,8 @@ class Node:
         """The hypotheses that it goes on from."""
         return [*([] if self.parent is None else [self.parent]), *self.also]
 
-    def since(self, step: int) -> list[Node]:
-        """The hypotheses that it went through, itself the last, as far back as a step."""
+    def chain_since(self, step: int) -> list[Node]:
+        """The hypotheses that its path went through, itself the last, as far back as a step."""
         chain = [self]
         while chain[-1].begin > step and chain[-1].parent is not None:
             chain.append(chain[-1].parent)
@@ -67,7 +67,7 @@ class Node:
 
     def residuals_m(self, first: int, last: int) -> Floats:
         """Residuals of its path over the steps from `first` on, before `last` [m]; NaN before its beginning."""
-        chain = self.since(first)
+        chain = self.chain_since(first)
         known = np.concatenate([node.along.residual_m for node in chain])
         whole_m = np.full(last - first, np.nan)
         begin = max(chain[0].begin, first)
@@ -79,26 +79,26 @@ class Node:
 
 
 class ResidualsBefore:
-    """Of a new hypothesis what it is compared by: its residuals before it, where each window of a test may begin."""
+    """What a new hypothesis is compared by: residuals of its path before it, from where each test may still look."""
 
     def __init__(self, node: Node, steps: PathSteps) -> None:
         self.node = node
         self._steps = steps
 
     @cached_property
-    def begins(self) -> Ints:
-        """First step of the longest look back of each window."""
+    def window_begins(self) -> Ints:
+        """First step of the longest look back of each window; shape (windows,)."""
         end_s = self._steps.end_s
         return np.asarray(np.searchsorted(end_s, end_s[self.node.begin] - 3.0 * np.array(WINDOWS_S)))
 
     @cached_property
     def residual_m(self) -> Floats:
         """Residuals over the longest window [m]."""
-        return self.node.residuals_m(int(self.begins[-1]), self.node.begin)
+        return self.node.residuals_m(int(self.window_begins[-1]), self.node.begin)
 
 
-class Span(NamedTuple):
-    """A hypothesis at the steps from `begin` on, before `end`; `p`: at each of them what speaks against it least."""
+class LifeSpan(NamedTuple):
+    """The steps over which a hypothesis counts, from `begin` on, before `end`; `p`: least p-value by each of them."""
 
     node: Node
     begin: int
@@ -126,7 +126,7 @@ class PathSet:
     overflow: int
     last_s: float
 
-    def living(self, delay_s: float) -> list[Span]:
+    def living(self, delay_s: float) -> list[LifeSpan]:
         """The hypotheses, each over the steps at which nothing up to `delay_s` before their end had refuted it."""
         known = np.searchsorted(self.steps.end_s, self.steps.end_s - delay_s, side="right") - 1
         spans = []
@@ -135,11 +135,14 @@ class PathSet:
             if end > node.begin:
                 tested = known[node.begin : end] + 1 - node.begin
                 tested = np.minimum(np.maximum(tested, 0), node.p_by_step.size - 1)
-                spans.append(Span(node, node.begin, end, node.p_by_step[tested]))
+                spans.append(LifeSpan(node, node.begin, end, node.p_by_step[tested]))
         return spans
 
     def survivors(self) -> list[Node]:
-        """Paths that live to the last step; of one that ends off the network, those refuted in its last minute."""
+        """Hypotheses that live to the last step.
+
+        Of a stretch that ends off the network, those refuted in its last minute.
+        """
         count = len(self.steps)
         found: list[Node] = []
         for stretch in {node.stretch for node in self.nodes}:
@@ -152,7 +155,7 @@ class PathSet:
             found += alive
         return found
 
-    def to_the_end(self) -> list[Span]:
+    def surviving_spans(self) -> list[LifeSpan]:
         """The hypotheses that live to the end of their stretch, or through one that does, with its p-value there."""
         lives: dict[int, tuple[Node, float]] = {}
         waiting = [(node, min(node.p, 1.0)) for node in self.survivors()]
@@ -162,15 +165,17 @@ class PathSet:
                 lives[id(node)] = node, p
                 waiting += [(origin, p) for origin in node.origins]
         ends = [(node, min(node.end, node.rejected), p) for node, p in lives.values()]
-        return [Span(node, node.begin, end, np.full(end - node.begin, p)) for node, end, p in ends if end > node.begin]
+        return [
+            LifeSpan(node, node.begin, end, np.full(end - node.begin, p)) for node, end, p in ends if end > node.begin
+        ]
 
-    def elements(self, delay_s: float | None = None) -> list[dict[int, float]]:
+    def elements_by_step(self, delay_s: float | None = None) -> list[dict[int, float]]:
         """Net elements of each step that no rejection rules out, with the largest p-value of a path over each.
 
         In hindsight, or by what was known `delay_s` before the end of each step. Empty: off the network.
         """
         found: list[dict[int, float]] = [{} for _ in range(len(self.steps))]
-        for node, begin, end, p in self.to_the_end() if delay_s is None else self.living(delay_s):
+        for node, begin, end, p in self.surviving_spans() if delay_s is None else self.living(delay_s):
             for best, value in zip(found[begin:end], p.tolist(), strict=True):
                 best[node.element] = max(best.get(node.element, 0.0), value)
         return found
@@ -181,9 +186,10 @@ _LINES = 24
 
 
 @frozen
-class Left:
-    """A path that was refuted: its last oriented element, at which step, its mean residual before the movement [m] and
-    the survey's sigma there [m].
+class RefutedPath:
+    """A path that was refuted: its last oriented element, and the step at which (`died`).
+
+    `before_m`: mean residual before the movement [m]; `survey_m`: the survey's sigma there [m].
     """
 
     oriented: int
@@ -194,7 +200,7 @@ class Left:
 
 @frozen
 class ReturnSearch:
-    """The steps of a run, and where they may lie on the network."""
+    """The search for a return of positions that left the network: the steps of a run, and where they may lie."""
 
     steps: PathSteps
     network: Network
@@ -202,39 +208,39 @@ class ReturnSearch:
     tests: PathTests
     config: MatchingConfig
 
-    def after(self, left: Left) -> int:
-        """The first step by which a movement has led back, the number of steps where none has."""
+    def first_return(self, left: RefutedPath) -> int:
+        """The first step by which a movement has led back to a refuted path, the number of steps where none has."""
         window = max(1, round(self.config.paths_level_s / float(self.steps.period_s[left.died])))
         if len(self.steps) - left.died < window:
             return len(self.steps)
-        behind, ahead = (self._without_choice(side) for side in (left.oriented ^ 1, left.oriented))
-        straight_m = self._windows_m({*ahead, *_turned(behind)}, left, window)
-        back = [*self._on_one_line(straight_m, left).tolist(), *self._over_switches(left, window)]
+        behind, ahead = (self._line_to_switch(side) for side in (left.oriented ^ 1, left.oriented))
+        straight_m = self._windows_m({*ahead, *_reversed(behind)}, left, window)
+        back = [*self._returns_on_line(straight_m, left).tolist(), *self._returns_over_switches(left, window)]
         return int(left.died + min(back) + window) if back else len(self.steps)
 
-    def _on_one_line(self, windows_m: Floats, left: Left) -> Ints:
-        """Windows by which the positions have moved back on a line without a choice."""
+    def _returns_on_line(self, windows_m: Floats, left: RefutedPath) -> Ints:
+        """Windows by which the positions have moved back on a line without a choice; `windows_m` as `_windows_m`."""
         means_m = windows_m.mean(axis=1)
         farthest_m = np.fmax(np.fmax.accumulate(means_m) - means_m, means_m - np.fmin.accumulate(means_m))
         # Out of reach for a whole window it was farther away than any measured offset.
         farthest_m[np.logical_or.accumulate(np.isnan(windows_m).all(axis=1))] = np.inf
-        stays = self._stays(means_m, left, windows_m.shape[1])
-        return np.flatnonzero(stays & (farthest_m > self._moved_m(left, means_m.size)))
+        stays = self._stay_back(means_m, left, windows_m.shape[1])
+        return np.flatnonzero(stays & (farthest_m > self._movement_limit_m(left, means_m.size)))
 
-    def _over_switches(self, left: Left, window: int) -> Iterator[int]:
-        """Windows by which they have moved back on a line beyond a switch.
+    def _returns_over_switches(self, left: RefutedPath, window: int) -> Iterator[int]:
+        """Windows by which the positions have moved back on a line beyond a switch.
 
         Behind it a branch moves aside as well as positions do: what counts is a movement relative to all tracks within
         reach at once, which keep their distances from one another meanwhile.
         """
-        lines = self._lines(left)
+        lines = self._possible_lines(left)
         if len(lines) < 2:
             return
         means_m = np.array([self._windows_m(line, left, window).mean(axis=1) for line in lines])
-        moved_m = self._moved_m(left, means_m.shape[1])
-        root_m = self._root_m(left, means_m.shape[1])
+        moved_m = self._movement_limit_m(left, means_m.shape[1])
+        root_m = self._position_sigma_m(left, means_m.shape[1])
         for own_m in means_m:
-            stays = self._stays(own_m, left, window)
+            stays = self._stay_back(own_m, left, window)
             for at in np.flatnonzero(stays & ~np.concatenate([[False], stays[:-1]])).tolist():
                 apart_m = means_m[:, : at + 1] - own_m[: at + 1]
                 known = np.isfinite(apart_m)
@@ -247,22 +253,25 @@ class ReturnSearch:
                     yield at
                     break
 
-    def _stays(self, means_m: Floats, left: Left, window: int) -> Bools:
-        """It lies where it lay before for as long again: what only passes on towards somewhere else does not."""
-        near = np.abs(means_m) <= self.config.paths_back_sigmas * self._root_m(left, means_m.size)
+    def _stay_back(self, means_m: Floats, left: RefutedPath, window: int) -> Bools:
+        """Windows that lie where the path lay, for as long again.
+
+        What only passes on towards somewhere else does not.
+        """
+        near = np.abs(means_m) <= self.config.paths_back_sigmas * self._position_sigma_m(left, means_m.size)
         stays: Bools = np.convolve(near, np.ones(window + 1))[: near.size] > window
         return stays
 
-    def _root_m(self, left: Left, size: int) -> Floats:
-        """Uncertainty of the last steps, position and survey together [m]."""
+    def _position_sigma_m(self, left: RefutedPath, size: int) -> Floats:
+        """Sigma of position and survey together at the last `size` steps [m]."""
         return np.hypot(self.steps.sigma_m[-size:], left.survey_m)
 
-    def _moved_m(self, left: Left, size: int) -> Floats:
-        """Limit by which two means a while apart differ on no path, at the last steps [m]."""
-        return self.tests.moved_m(self.steps.sigma_m[-size:], np.full(size, left.survey_m))
+    def _movement_limit_m(self, left: RefutedPath, size: int) -> Floats:
+        """Limit beyond which two means a while apart differ on no path, at the last `size` steps [m]."""
+        return self.tests.movement_limit_m(self.steps.sigma_m[-size:], np.full(size, left.survey_m))
 
-    def _windows_m(self, line: set[int], left: Left, window: int) -> Floats:
-        """Windows of the offset from a line less that before the movement, by the step that each begins with.
+    def _windows_m(self, line: set[int], left: RefutedPath, window: int) -> Floats:
+        """Offsets from a line, less that before the movement, over `window` steps each; shape (windows, window) [m].
 
         NaN where the line is not within reach.
         """
@@ -270,7 +279,7 @@ class ReturnSearch:
         nearest_m = np.full(count, np.inf)
         offset_m = np.full(count, np.nan)
         for one in line:
-            rows = self.candidates.of(one // 2, left.died, count)
+            rows = self.candidates.rows_of(one // 2, left.died, count)
             rows = rows[self.candidates.beyond_m[rows] <= self.config.paths_end_m]
             rows = rows[self.candidates.distance_m[rows] < nearest_m[self.candidates.step[rows]]]
             step = self.candidates.step[rows]
@@ -278,13 +287,13 @@ class ReturnSearch:
             offset_m[step] = self.candidates.offset_m[rows] * (1.0 - 2.0 * (one % 2))
         return np.asarray(sliding_window_view(offset_m[left.died :], window) - left.before_m)
 
-    def _lines(self, left: Left) -> list[set[int]]:
+    def _possible_lines(self, left: RefutedPath) -> list[set[int]]:
         """The line with every choice at the switches ahead, and with every one behind; none beyond what is near."""
-        behind, ahead = (self._without_choice(side) for side in (left.oriented ^ 1, left.oriented))
-        onward = [{*line, *_turned(behind)} for line in self._choices(left.oriented, left.died)]
-        return onward + [{*ahead, *_turned(line)} for line in self._choices(left.oriented ^ 1, left.died)]
+        behind, ahead = (self._line_to_switch(side) for side in (left.oriented ^ 1, left.oriented))
+        onward = [{*line, *_reversed(behind)} for line in self._chains_onward(left.oriented, left.died)]
+        return onward + [{*ahead, *_reversed(line)} for line in self._chains_onward(left.oriented ^ 1, left.died)]
 
-    def _choices(self, oriented: int, died: int) -> list[list[int]]:
+    def _chains_onward(self, oriented: int, died: int) -> list[list[int]]:
         """Chains of net elements from one on, over elements near the steps since a path died."""
         near = set(np.unique(self.candidates.element[self.candidates.first[died] :]).tolist())
         lines: list[list[int]] = []
@@ -298,7 +307,7 @@ class ReturnSearch:
                 lines.append(line)
         return lines
 
-    def _without_choice(self, oriented: int) -> list[int]:
+    def _line_to_switch(self, oriented: int) -> list[int]:
         """An oriented element and those after it, up to the first switch that leaves a choice, or an open end."""
         line = [oriented]
         while len(onward := self.network.successors[line[-1]]) == 1 and onward[0].to not in line:
@@ -306,6 +315,6 @@ class ReturnSearch:
         return line
 
 
-def _turned(line: list[int]) -> list[int]:
+def _reversed(line: list[int]) -> list[int]:
     """The same chain, run in the opposite direction."""
     return [one ^ 1 for one in line]

@@ -53,7 +53,7 @@ class PathSteps:
 
     @property
     def begin_ns(self) -> Ints:
-        """Instant of the first position of each step."""
+        """Instant of the first position of each step [ns]."""
         return np.round(self.begin_s * NS_PER_S).astype(np.int64) + self.start_ns
 
     @cached_property
@@ -128,14 +128,14 @@ def path_steps(
         points=means,
         sigma_m=mean_sigma_m,
         distance_m=np.where(known, np.maximum(moved_m, chord_m), chord_m),
-        counted=counted & ~outliers(means, mean_sigma_m),
-        along_m=_along_m(means, counted_m) if independent else np.full(len(means), np.nan),
+        counted=counted & ~are_outliers(means, mean_sigma_m),
+        along_m=_odometer_offset_m(means, counted_m) if independent else np.full(len(means), np.nan),
         with_odometer=np.logical_or.accumulate(known),
         read_element=read_element,
     )
 
 
-def outliers(points: Points, sigma_m: Floats) -> Bools:
+def are_outliers(points: Points, sigma_m: Floats) -> Bools:
     """Steps far from the middle of their neighbours: reflections follow no model of errors."""
     count = len(points)
     reach = _NEIGHBOURS
@@ -151,7 +151,7 @@ def outliers(points: Points, sigma_m: Floats) -> Bools:
     return far
 
 
-def _along_m(points: Points, counted_m: Floats) -> Floats:
+def _odometer_offset_m(points: Points, counted_m: Floats) -> Floats:
     """Position along the direction of travel minus an independent odometer [m]; NaN where it does not count."""
     if len(points) < _HEADING_STEPS:
         return np.full(len(points), np.nan)
@@ -170,17 +170,17 @@ _MARGIN_SIGMAS = 10.0
 
 
 class Move(NamedTuple):
-    """The elements between two places, and how the first is left.
-
-    `sense`: +1 ahead, -1 behind, 0 not at all.
-    """
+    """The elements between two places, in order of travel, and how the first is left."""
 
     between: tuple[int, ...]
     sense: int
 
 
 class StepDistance(NamedTuple):
-    """Between two steps [m]: signed in the odometer's sense where `measured`, else its size; how far to search."""
+    """Distance between two steps [m]: signed in the odometer's sense where `measured`, else its size.
+
+    `limit_m`: how far routes are searched for [m].
+    """
 
     distance_m: float
     measured: bool
@@ -197,10 +197,11 @@ class Place(NamedTuple):
 
 @frozen
 class Moves:
-    """`counted_m`: signed distance at each step by an odometer, NaN where unknown; `doubt_m`: running sum of its doubt.
+    """What it costs to move between places on the network, by odometer or positions.
 
-    Distances compare where nothing of them came into doubt between.
-    `polarity`: its sign against each oriented element, 0 where unknown.
+    `counted_m`: signed distance at each step by an odometer, NaN where unknown; `doubt_m`: running sum of its doubt.
+    Distances compare where nothing of them came into doubt between. `polarity`: its sign against each oriented element,
+    0 where unknown.
     """
 
     network: Network
@@ -212,30 +213,30 @@ class Moves:
 
     @classmethod
     def without_odometer(cls, network: Network, steps: PathSteps, config: MatchingConfig) -> Moves:
-        """Moves of which only the positions say how far they are."""
+        """Moves whose length only the positions show."""
         count = len(steps)
         unknown = np.zeros(len(network.successors), dtype=np.int64)
         return cls(network, steps, np.full(count, np.nan), np.zeros(count), unknown, config)
 
     def distance(self, earlier: int, later: int) -> StepDistance:
-        """Distance between steps by the odometer where it knows it, else straight on [m]."""
+        """Distance between two steps, by the odometer where it knows it, else straight on."""
         places = self.steps.points.surface
         chord_m = float(np.linalg.norm(places[later] - places[earlier]))
         counted_m = float("nan")
         if self._doubts_m[later] == self._doubts_m[earlier]:
-            counted_m = self._at_m[later] - self._at_m[earlier]
+            counted_m = self._counted_list_m[later] - self._counted_list_m[earlier]
         measured = bool(np.isfinite(counted_m))
         distance_m = counted_m if measured else chord_m
         limit_m = (1.0 + self.config.detour_share) * max(chord_m, abs(distance_m)) + self.config.detour_m
         return StepDistance(distance_m, measured, limit_m)
 
-    def cost(self, here: Place, there: Place, distance: StepDistance) -> float:
+    def least_cost(self, here: Place, there: Place, distance: StepDistance) -> float:
         """The least cost of a move between two places, infinite where the network has none."""
-        return min((cost for cost, _, _ in self._all(here, there, distance)), default=np.inf)
+        return min((cost for cost, _, _ in self._possible_moves(here, there, distance)), default=np.inf)
 
-    def best(self, here: Place, there: Place) -> Move | None:
-        """The move of least cost, none where the network has none."""
-        moves = self._all(here, there, self.distance(here.step, there.step))
+    def best_move(self, here: Place, there: Place) -> Move | None:
+        """The move of least cost between two places; None where the network has none."""
+        moves = self._possible_moves(here, there, self.distance(here.step, there.step))
         chosen = min(moves, key=lambda move: move[0], default=None)
         if chosen is None:
             return None
@@ -244,16 +245,18 @@ class Moves:
 
     @property
     def break_cost(self) -> float:
-        """Cost of going over to a track that no relation leads to: so many seconds of positions off the path."""
+        """Cost of going over to a track that no relation leads to: that of `break_s` of positions off the path."""
         return self.config.break_s * self.config.outlier_sigmas**2
 
-    def _all(self, here: Place, there: Place, distance: StepDistance) -> Iterator[tuple[float, int, tuple[int, ...]]]:
-        """Cost and sense of every move, and what lies between: on the element, ahead, behind.
+    def _possible_moves(
+        self, here: Place, there: Place, distance: StepDistance
+    ) -> Iterator[tuple[float, int, tuple[int, ...]]]:
+        """Cost, sense and elements between, of every move from one place to another: on the element, ahead, behind.
 
         A relation that is passed against its navigability costs as much as a break.
         """
         if here.oriented == there.oriented:
-            yield self._mismatch(there.at_m - here.at_m, here.oriented, distance), 0, ()
+            yield self._mismatch_cost(there.at_m - here.at_m, here.oriented, distance), 0, ()
         for sense, first, last in ((1, here, there), (-1, there, here)):
             # From the exit of the first to the entry of the last, both run in the sense of their elements.
             found = self.network.reach(first.oriented, distance.limit_m).get(last.oriented)
@@ -261,43 +264,44 @@ class Moves:
                 continue
             ends_m = self.network.length_m(first.oriented) - first.at_m + last.at_m
             driven_m = sense * (ends_m + found.distance_m)
-            cost = self._mismatch(driven_m, here.oriented, distance)
+            cost = self._mismatch_cost(driven_m, here.oriented, distance)
             barred = found.barred_forward if sense > 0 else found.barred_backward
             yield cost + (self.break_cost if barred else 0.0), sense, found.chain.between
             if cost > 1.0 and distance.measured and abs(driven_m) < abs(distance.distance_m):
                 # Another route may be as long as the odometer says.
-                for chain in self._longer(first.oriented, last.oriented, sense, distance.limit_m - ends_m):
+                for chain in self._longer_routes(first.oriented, last.oriented, sense, distance.limit_m - ends_m):
                     driven_m = sense * (ends_m + chain.entry_m[-1])
-                    yield self._mismatch(driven_m, here.oriented, distance), sense, chain.between
+                    yield self._mismatch_cost(driven_m, here.oriented, distance), sense, chain.between
 
-    def _longer(self, first: int, last: int, sense: int, limit_m: float) -> Iterator[Chain]:
-        """Routes from the exit of an element to the entry of another, of those as long as each other the first
-        found.
+    def _longer_routes(self, first: int, last: int, sense: int, limit_m: float) -> Iterator[Chain]:
+        """Routes, but for the shortest, from the exit of one element to the entry of another.
+
+        Of equally long ones the first.
         """
         apart_m = self.config.detour_m / _MARGIN_SIGMAS
         found = search(
             self.network,
             Chain.behind(self.network, first),
             limit_m,
-            lambda chain: self._allowed(chain, sense),
+            lambda chain: self._navigable_edges(chain, sense),
             lambda chain: (len(chain.oriented) > 1, chain.oriented[-1], round(chain.entry_m[-1] / apart_m)),
         )
         return (reach.chain for reach in islice(found, 1, None) if reach.chain.oriented[-1] == last)
 
-    def _allowed(self, chain: Chain, sense: int) -> Iterator[Edge]:
-        """Edges that may be run over after a chain, in one sense."""
+    def _navigable_edges(self, chain: Chain, sense: int) -> Iterator[Edge]:
+        """Relations that lead on from a chain, navigable in one sense."""
         onward = self.network.successors[chain.oriented[-1]]
         return (edge for edge in onward if (edge.forward if sense > 0 else edge.backward))
 
-    def _mismatch(self, driven_m: float, oriented: int, distance: StepDistance) -> float:
-        """Square of the difference from the distance run over its own sigma, limited as that of every position."""
+    def _mismatch_cost(self, driven_m: float, oriented: int, distance: StepDistance) -> float:
+        """Square of the difference from the distance run over its sigma, limited as that of every position."""
         sign = int(self.polarity[oriented]) if distance.measured else 0
         apart_m = driven_m - sign * distance.distance_m if sign else abs(driven_m) - abs(distance.distance_m)
         root_m = (self.config.detour_share * abs(distance.distance_m) + self.config.detour_m) / _MARGIN_SIGMAS
         return min((apart_m / root_m) ** 2, self.config.outlier_sigmas**2)
 
     @cached_property
-    def _at_m(self) -> list[float]:
+    def _counted_list_m(self) -> list[float]:
         """Counted distance at each step, as a list [m]."""
         return [float(value) for value in self.counted_m]
 

@@ -183,8 +183,8 @@ def _link_visits(
     """
     begin = _place(origin, step - 1)
     end = _place(node, step)
-    move = moves.best(begin, end)
-    if move is None or moves.cost(begin, end, moves.distance(begin.step, end.step)) >= moves.break_cost:
+    move = moves.best_move(begin, end)
+    if move is None or moves.least_cost(begin, end, moves.distance(begin.step, end.step)) >= moves.break_cost:
         return []
     at = step - 1 - first
     sense = move.sense or 1

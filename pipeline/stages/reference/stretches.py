@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 import polars as pl
 
-from pipeline.stages.paths.candidates import Candidates, Search, candidates_of, search_about, segments_of
+from pipeline.stages.paths.candidates import Candidates, SegmentSearch, candidates_of, search_about, segments_of
 from pipeline.stages.paths.growth import path_set
 from pipeline.stages.paths.path_steps import path_steps
 from pipeline.stages.reference.routes import ElementStay, routes_of
@@ -162,7 +162,7 @@ class _Search:
         for stay, (number, entry_m) in zip(stays, placed, strict=True):
             low = int(begins[max(stay.first - 1, 0)])
             high = int(ends[min(stay.last + 1, ends.size - 1)])
-            rows = near.of(stay.oriented // 2, low, high)
+            rows = near.rows_of(stay.oriented // 2, low, high)
             sample = near.step[rows] - begin
             nearer = near.distance_m[rows] < nearest_m[sample]
             sample, rows = sample[nearer], rows[nearer]
@@ -205,7 +205,7 @@ def off_the_survey(samples: Samples, network: Network, config: HazardConfig) -> 
     possible = near.distance_m <= config.evidence_factor * samples.root_m
     tracks = np.bincount(near.step, minlength=count)
     for element, end in _open_ends(network, np.unique(near.element)):
-        rows = near.of(element, 0, count)
+        rows = near.rows_of(element, 0, count)
         sample = near.step[rows]
         behind = near.past[rows] == 2 * end - 1
         other_near = tracks > np.bincount(sample, minlength=tracks.size)
@@ -277,7 +277,7 @@ class Samples:
     sigma_m: Floats
     near: Candidates
     survey_m: Floats
-    search: Search
+    search: SegmentSearch
 
     @property
     def root_m(self) -> Floats:

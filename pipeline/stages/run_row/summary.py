@@ -17,7 +17,7 @@ from pipeline.stages.evidence import TrainEvidence
 from pipeline.stages.judge.failures import Failure, failures_of_part
 from pipeline.stages.judge.judge import Judged
 from pipeline.stages.judge.judged import JudgedEpochs
-from pipeline.stages.matching.epochs import contradictory_covariances
+from pipeline.stages.matching.epochs import count_contradictory_covariances
 from pipeline.stages.monitored import MonitoredSolution
 from pipeline.stages.odometry import Odometry
 from pipeline.stages.prepare import Provenance
@@ -92,7 +92,7 @@ def replay_notes(monitored: MonitoredSolution, evidence: TrainEvidence) -> list[
             Note.SPANS_DIFFER: _span_differences_s(run),
             **_odometer_notes(prepared.odometry, prepared.config.align.straight_s),
             Note.ODOMETER_REVERSED: monitored.match.odometer_sign < 0 and prepared.vehicle.gnss_antenna_ahead_m,
-            Note.COVARIANCE: contradictory_covariances(monitored.solution.fixes),
+            Note.COVARIANCE: count_contradictory_covariances(monitored.solution.fixes),
             Note.AMBIGUOUS: ", ".join(say("ambiguity", "stretch", **row) for row in doubtful),
             Note.OFF_NETWORK: _listed([_off_network_words(row) for row in monitored.match.off.iter_rows(named=True)]),
             Note.UNLINKED: _count_unlinked(monitored.lds.linking["link_distance"]),

@@ -49,7 +49,7 @@ class ScriptedBank:
     ) -> None:
         self.fails, self.rings, self.blind = set(fails), set(rings), set(blind)
         self.fast = self.fails if fast is None else set(fast)
-        self.begins = set(begins)
+        self.window_begins = set(begins)
         self.started = 0
         self.frozen: list[int] = []
         self.unknown = set(unknown)
@@ -91,7 +91,7 @@ class ScriptedBank:
         self.frozen.append(epoch)
 
     def begins_at(self, epoch: int) -> bool:
-        return epoch in {0, *self.begins, *self.restarted}
+        return epoch in {0, *self.window_begins, *self.restarted}
 
     def restart(self, epoch: int) -> None:
         self.restarted.append(epoch)

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from pipeline.stages.paths.candidates import Candidates, overtaken
+from pipeline.stages.paths.candidates import Candidates, belong_beyond
 from tests.stages.evidence.test_chains import line
 
 # On element a (100 m) and on b, which begins where a ends: metres from the start, and metres past which end.
@@ -44,13 +44,13 @@ def candidates(*places: tuple[int, Place]) -> Candidates:
     ],
 )
 def test_at_a_joint_a_position_has_one_place(on_a: Place, on_b: Place, kept: str) -> None:
-    out = overtaken(candidates((0, on_a), (1, on_b)), line("both"))
+    out = belong_beyond(candidates((0, on_a), (1, on_b)), line("both"))
     assert "".join(np.array(["a", "b"])[~out]) == kept
 
 
 def test_only_what_the_track_goes_on_to_overtakes() -> None:
     """c lies behind b; a position past the end of a, and inside c, may have left the track between."""
-    out = overtaken(candidates((0, (100.0, 3.0, PAST_END)), (2, (1.0, 0.0, INSIDE))), line("both"))
+    out = belong_beyond(candidates((0, (100.0, 3.0, PAST_END)), (2, (1.0, 0.0, INSIDE))), line("both"))
     assert out.tolist() == [False, False]
-    alone = overtaken(candidates((0, (100.0, 3.0, PAST_END))), line("both"))
+    alone = belong_beyond(candidates((0, (100.0, 3.0, PAST_END))), line("both"))
     assert alone.tolist() == [False]

@@ -10,7 +10,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from pipeline.stages.matching.epochs import contradictory_covariances
+from pipeline.stages.matching.epochs import count_contradictory_covariances
 from pipeline.stages.track.geodesy import points_of
 from pipeline.stages.track.path import TravelledPath
 from pipeline.stages.track.segments import Visit, leg_of
@@ -106,7 +106,7 @@ def test_a_correlation_that_cannot_be_is_not_used() -> None:
     )
     epochs = matched(fixes, place).epochs.table
     assert np.allclose(epochs["sigma_cross_m"], [np.sqrt(3.0), np.sqrt(2.0)], atol=1e-3)
-    assert contradictory_covariances(fixes) == 1
+    assert count_contradictory_covariances(fixes) == 1
 
 
 @pytest.mark.parametrize(

@@ -7,7 +7,7 @@ import polars as pl
 import pytest
 
 from pipeline.stages.matching import match
-from pipeline.stages.matching.epochs import Shape, Written, digit_steps, step_m
+from pipeline.stages.matching.epochs import RecordedDigits, TrackShape, coordinate_step_m, digit_deviations_m
 from schemas.config import FixSigma, MatchingConfig, Vehicle
 from tests.replay.journeys import VEHICLE, hides_no_fault, journey, replay
 from tests.stages.matching.builders import line, run, site
@@ -29,27 +29,27 @@ def latitudes(seed=0, count=4000):
 @pytest.mark.parametrize("seed", range(3))
 def test_the_step_of_decimals_minutes_and_single_precision(seed, step_deg):
     written = np.round(latitudes(seed) / step_deg) * step_deg
-    assert step_m(written, _PER_DEG_M, LEAST_M) == pytest.approx(step_deg * _PER_DEG_M, rel=1e-4)
+    assert coordinate_step_m(written, _PER_DEG_M, LEAST_M) == pytest.approx(step_deg * _PER_DEG_M, rel=1e-4)
 
 
 @pytest.mark.parametrize("seed", range(3))
 def test_digits_enough_or_no_digits_are_no_step(seed):
     values = latitudes(seed)
-    assert step_m(values, _PER_DEG_M, LEAST_M) == 0.0
-    assert step_m(np.round(values, 7), _PER_DEG_M, LEAST_M) == 0.0
-    assert step_m(np.full(100, 50.8), _PER_DEG_M, LEAST_M) == 0.0
-    assert step_m(np.round(values[:6], 5), _PER_DEG_M, LEAST_M) == 0.0
-    assert step_m(50.8 + 1e-4 * np.arange(100), _PER_DEG_M, LEAST_M) == 0.0
+    assert coordinate_step_m(values, _PER_DEG_M, LEAST_M) == 0.0
+    assert coordinate_step_m(np.round(values, 7), _PER_DEG_M, LEAST_M) == 0.0
+    assert coordinate_step_m(np.full(100, 50.8), _PER_DEG_M, LEAST_M) == 0.0
+    assert coordinate_step_m(np.round(values[:6], 5), _PER_DEG_M, LEAST_M) == 0.0
+    assert coordinate_step_m(50.8 + 1e-4 * np.arange(100), _PER_DEG_M, LEAST_M) == 0.0
     one_off = np.round(values, 5)
     one_off[2000] += 0.3e-5
-    assert step_m(one_off, _PER_DEG_M, LEAST_M) == 0.0
+    assert coordinate_step_m(one_off, _PER_DEG_M, LEAST_M) == 0.0
 
 
 def test_the_finest_step_that_counts_is_a_setting():
     """Seven decimals of a degree are 11 mm; positions of a run show it under the deviation of a uniform error."""
     written = np.round(latitudes(), 7)
-    assert step_m(written, _PER_DEG_M, 0.011) == pytest.approx(0.01112, abs=1e-5)
-    assert step_m(written, _PER_DEG_M, 0.012) == 0.0
+    assert coordinate_step_m(written, _PER_DEG_M, 0.011) == pytest.approx(0.01112, abs=1e-5)
+    assert coordinate_step_m(written, _PER_DEG_M, 0.012) == 0.0
     x_m = np.cumsum(2.0 + np.sin(np.arange(400) / 9.0))
     fixes = run(x_m, np.zeros(400)).with_columns(pl.col("longitude_deg").round(7))
     sigmas_m = [
@@ -63,8 +63,8 @@ def test_the_finest_step_that_counts_is_a_setting():
 
 
 def turned_m(fixes, heading_deg):
-    shape = Shape(heading_deg, *(np.zeros(heading_deg.size) for _ in range(4)))
-    return Written("primary", *digit_steps(fixes, LEAST_M)).turned_m(shape)
+    shape = TrackShape(heading_deg, *(np.zeros(heading_deg.size) for _ in range(4)))
+    return RecordedDigits("primary", *digit_deviations_m(fixes, LEAST_M)).along_cross_up_m(shape)
 
 
 def test_noise_is_turned_into_the_track():

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from pipeline.stages.matching.claims import OneTrack
+from pipeline.stages.matching.claims import SwitchZones
 from pipeline.stages.paths.growth import path_set
 from pipeline.stages.paths.path_steps import path_steps
 from pipeline.stages.track.geodesy import points_of
@@ -49,12 +49,12 @@ def test_branches_are_one_track_until_they_are_a_gauge_apart(cut_m: float) -> No
     way_m = np.arange(-50.0, -10.0)
     latitude, longitude = degrees(way_m, np.zeros(way_m.size))
     steps = path_steps((way_m * 1e9).astype(np.int64), points_of(latitude, longitude), np.full(way_m.size, 0.02))
-    one_track = OneTrack(path_set(steps, network, MatchingConfig()), 1.5)
+    one_track = SwitchZones(path_set(steps, network, MatchingConfig()), 1.5)
     branch = network.track.ids.index("d0")
-    assert one_track.zone(2 * branch + 1).length_m == pytest.approx(APART_M, abs=0.1)
-    assert one_track.zone(2 * branch).length_m == 0.0
+    assert one_track.zone_beyond(2 * branch + 1).length_m == pytest.approx(APART_M, abs=0.1)
+    assert one_track.zone_beyond(2 * branch).length_m == 0.0
     # The stem has no branch beside it.
-    assert one_track.zone(2 * network.track.ids.index("s")).length_m == 0.0
+    assert one_track.zone_beyond(2 * network.track.ids.index("s")).length_m == 0.0
 
 
 @pytest.mark.parametrize("cut_m", [400.0, 10.0])

@@ -10,7 +10,7 @@ import polars as pl
 import pytest
 
 from pipeline.stages.matching import match
-from pipeline.stages.matching.epochs import contradictory_covariances, on_track_limit_m
+from pipeline.stages.matching.epochs import count_contradictory_covariances, on_track_limit_m
 from pipeline.stages.matching.match import read_elements
 from pipeline.stages.track.survey import track_of
 from schemas.config import FixSigma, MatchingConfig, Vehicle
@@ -40,7 +40,7 @@ def test_no_covariance_is_larger_than_its_variances_allow(
     east_m2: float, both_m2: float, north_m2: float, count: int
 ) -> None:
     frame = pl.DataFrame({"cov_ee_m2": [east_m2], "cov_en_m2": [both_m2], "cov_nn_m2": [north_m2]})
-    assert contradictory_covariances(frame) == count
+    assert count_contradictory_covariances(frame) == count
 
 
 def test_an_element_shorter_than_positions_scatter_is_the_same_way() -> None:

@@ -77,5 +77,5 @@ def _refuted(steps: PathSteps, jump_m: float) -> bool:
     zeros = np.zeros(count)
     config = MatchingConfig(cross_bias_sigma_m=1e-6)
     tests = PathTests.of_run(steps, 0, config)
-    verdict = tests.of(steps, Trail(0, 0, 0, Stretch(aside_m, *[zeros] * 4), NO_STEPS))
+    verdict = tests.test_trail(steps, Trail(0, 0, 0, Stretch(aside_m, *[zeros] * 4), NO_STEPS))
     return verdict.rejected < count

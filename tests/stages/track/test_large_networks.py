@@ -98,7 +98,7 @@ def test_candidates_about_a_run_are_those_of_a_search_everywhere(seed: int) -> N
     points = points_of(track.latitude_deg[near] + 2e-4, track.longitude_deg[near])
     for reach_m in (30.0, 200.0):
         about = candidates_of(points, network, search_about(points.surface, network, reach_m), reach_m)
-        everywhere = candidates_of(points, network, segments_of(track).search(), reach_m)
+        everywhere = candidates_of(points, network, segments_of(track).search_in(), reach_m)
         assert len(about.step) > 10
         for name in vars(everywhere):
             np.testing.assert_array_equal(getattr(about, name), getattr(everywhere, name))
