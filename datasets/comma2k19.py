@@ -14,7 +14,7 @@ import pyproj
 
 from datasets.to_contract import conformed, table_of, virtual_balises
 from pipeline.read.ingest.timescale import GPS_EPOCH_NS, utc_from_gps
-from pipeline.stages.track.geodesy import distances_m, points_of
+from pipeline.stages.track.geodesy import point_distances_m, points_of
 from schemas.arrays import NS_PER_S, Floats
 from schemas.enums import Fix, Origin
 from schemas.errors import InputError
@@ -160,7 +160,7 @@ def _site(places: dict[str, Floats], balises_at_m: Sequence[float]) -> Site:
     kept = _poses_apart(places)
     track = {name: values[kept] for name, values in places.items()}
     measure = np.concatenate(
-        ([0.0], np.cumsum(distances_m(track["latitude_deg"], track["longitude_deg"], track["height_m"])))
+        ([0.0], np.cumsum(point_distances_m(track["latitude_deg"], track["longitude_deg"], track["height_m"])))
     )
     table = table_of(Track, netelement_id=_ELEMENT, measure_m=measure, **track, sigma_m=_POSE_SIGMA_M)
     balises = [(_ELEMENT, at_m) for at_m in balises_at_m]

@@ -6,7 +6,7 @@ import numpy as np
 import polars as pl
 
 from pipeline.stages.prepare import prepare
-from pipeline.stages.track.geodesy import curvature_radii_m, distances_m, moved_deg
+from pipeline.stages.track.geodesy import curvature_radii_m, moved_deg, point_distances_m
 from schemas.arrays import Floats, Ints, floats
 from schemas.config import Configuration, Vehicle
 from schemas.errors import InputError
@@ -162,12 +162,12 @@ def _distance_of_positions_m(latitude_deg: Floats, longitude_deg: Floats, height
     kept = [0]
     for i in range(1, latitude_deg.size):
         pair = [values[[kept[-1], i]] for values in (latitude_deg, longitude_deg, height_m)]
-        if distances_m(*pair)[0] >= _BIN_M:
+        if point_distances_m(*pair)[0] >= _BIN_M:
             kept.append(i)
     if kept[-1] != latitude_deg.size - 1 and len(kept) > 1:
         # What is left at the end belongs to the last step, as noise of a train that stands or its last metres.
         kept[-1] = latitude_deg.size - 1
-    lengths = distances_m(latitude_deg[kept], longitude_deg[kept], height_m[kept])
+    lengths = point_distances_m(latitude_deg[kept], longitude_deg[kept], height_m[kept])
     return np.interp(np.arange(latitude_deg.size), kept, np.concatenate(([0.0], np.cumsum(lengths))))
 
 

@@ -121,7 +121,7 @@ def _of_solution(prepared: PreparedRun, solution: str, channel: Channel, evidenc
     fit, matches = _fitted(prepared, solution, channel)
     monitored = monitor_solution(prepared, solution, matches, evidence)
     unnoticed = unnoticed_of(monitored)
-    judged = judge(_case(monitored, unnoticed, evidence, fit.leaps_s(evidence.in_step)))
+    judged = judge(_case(monitored, unnoticed, evidence, fit.leaps_s(evidence.shares_odometer_clock)))
     results = _results(monitored, judged, unnoticed, fit, evidence)
     suspect = pl.Series("suspect_after_the_fact", judged.suspect_after_the_fact)
     of_fixes = monitored.solution.fixes["satellites"]
@@ -171,7 +171,7 @@ def _results(
         "misfits": fit.codes,
         "duplicates": counts.duplicates,
         "out_of_order": counts.out_of_order,
-        "odometer_contradicted": evidence.contradicted,
+        "odometer_contradicted": evidence.count_contradicted_gaps,
         "odometer_origin": None if odometry is None else odometry.origin,
         "odometer_follows": prepared.follows_of(monitored.solution.name).ratio,
         "ambiguous_stretches": monitored.match.ambiguous.height,
@@ -183,11 +183,13 @@ def _results(
     against = {
         Reason.ODOMETER_ORIGIN_UNKNOWN: odometry is not None and not odometry.origin.independent,
         Reason.ODOMETER_FOLLOWS_GNSS: odometry is not None and odometry.follows_gnss,
-        Reason.EVIDENCE_DISPUTED: evidence.disputed > 0 or evidence.parted,
+        Reason.EVIDENCE_DISPUTED: evidence.count_disputed_reads > 0 or evidence.parted,
         Reason.EVIDENCE_CONTRADICTED: evidence.doubted > 0,
         Reason.TRACK_ASSUMED: _track_assumed(judged),
         Reason.SIGMA_DOUBTFUL: refuted(accuracy),
-        Reason.INPUT_DOUBTFUL: bool(fit.unproving or fit.leaps_s(evidence.in_step) or counts.contradicting),
+        Reason.INPUT_DOUBTFUL: bool(
+            fit.unproving or fit.leaps_s(evidence.shares_odometer_clock) or counts.contradicting
+        ),
         Reason.CLOCK_ASSUMED: evidence.clock_assumed,
     }
     return SolutionResults(
@@ -199,7 +201,7 @@ def _results(
         ingest=run.notes,
         notes=[*fit.notes, *replay_notes(monitored, evidence)],
         reasons=[reason for reason, applies in against.items() if applies],
-        anchored_ns=evidence.anchored_ns,
+        anchored_ns=evidence.anchored_span_ns,
         clock_open_s=evidence.clock_open_s,
     )
 

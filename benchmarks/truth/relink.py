@@ -119,7 +119,7 @@ def lds_of(made: Journey, config: Configuration, vehicle: Vehicle | None = None)
     aligned = align(found.epochs, along, vehicle, config)
     bank = MonitorBank(aligned, {}, config)
     scale_sigma = None if odometry is None else odometry.scale_sigma
-    return aligned, run_lds(aligned, bank, found.path.balises(site.balises), None, scale_sigma, config)
+    return aligned, run_lds(aligned, bank, found.path.balises_on_path(site.balises), None, scale_sigma, config)
 
 
 def outcome(made: Journey, config: Configuration) -> Outcome:

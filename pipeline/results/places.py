@@ -122,7 +122,7 @@ def ground_at(track: pl.DataFrame, stretches: pl.DataFrame, path_m: Floats, marg
         # Path positions of the whole element, not just of the epochs on it.
         ends = [first_m, last_m]
         if name in survey.index:
-            measures = survey.measure_m[survey.vertices(survey.index[name])][[0, -1]]
+            measures = survey.measure_m[survey.vertex_range(survey.index[name])][[0, -1]]
             ends += list(offset_m + sign * measures)
         away = np.maximum(np.maximum(min(ends) - path_m, path_m - max(ends)), 0.0)
         nearer = (away < best) & (away <= margin_m)
@@ -174,7 +174,7 @@ def _thinned(values: Floats) -> Floats:
 
 def _on_element(track: SurveyedTrack, number: int, measure_m: Floats) -> tuple[Floats, Floats, Floats, Floats]:
     """Latitude, longitude, height, heading of measures on one element."""
-    rows = track.vertices(number)
+    rows = track.vertex_range(number)
     measures = track.measure_m[rows]
     if len(measures) < 2:
         nothing = np.full(len(measure_m), np.nan)

@@ -89,7 +89,7 @@ def monitor_solution(
     blind_along = NotEvaluated.ODOMETER_OF_GNSS if odometry is not None and odometry.of_gnss else None
     singles = _without_memory(prepared, solution, aligned, channel)
     bank = MonitorBank(aligned, singles, config, blind_along)
-    balises = matched.path.balises(prepared.site.balises)
+    balises = matched.path.balises_on_path(prepared.site.balises)
     reads = _reads_on_odometer(prepared.run.balise_reads, aligned, odometry)
     scale_sigma = None if odometry is None else odometry.scale_sigma
     lds = run_lds(aligned, bank, balises, reads, scale_sigma, config, solution)

@@ -19,7 +19,7 @@ from pipeline.stages.clean.clean import (
 )
 from pipeline.stages.evidence import TrainEvidence, evidence_of
 from pipeline.stages.evidence.anchors import read_anchors
-from pipeline.stages.evidence.gathering import on_time, without_frozen
+from pipeline.stages.evidence.gathering import without_frozen, without_latency
 from pipeline.stages.follows import NOT_TESTED, Follows, follows_positions
 from pipeline.stages.matching import Match, match
 from pipeline.stages.odometry import Odometry, counted_over_slip, odometry_of
@@ -105,10 +105,10 @@ class PreparedRun:
         """What is known of where the train was; knows of no solution."""
         network = site_network(self.site)
         pieces = network_in_pieces(self.site)
-        recorded = on_time(self.run.reference, self.vehicle.reference_latency_s)
+        recorded = without_latency(self.run.reference, self.vehicle.reference_latency_s)
         moving = without_frozen(recorded, self.odometers, self.config.hazards)
         reference = reference_stretches(moving, pieces, network.track.index, self.config)
-        reads = on_time(self.run.balise_reads, self.vehicle.reads_latency_s)
+        reads = without_latency(self.run.balise_reads, self.vehicle.reads_latency_s)
         recorders = [
             read_anchors(reads, self.site.balises, network.track, self.config.hazards),
         ]

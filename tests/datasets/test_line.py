@@ -8,7 +8,7 @@ import pytest
 
 from datasets.line import balises_table, build_line, element_at, links_table, offset_places, track_table
 from datasets.scenario import LineSpec
-from pipeline.stages.track.geodesy import distances_m, earth_centred_m
+from pipeline.stages.track.geodesy import earth_centred_m, point_distances_m
 from schemas.errors import ConfigError
 from tests.datasets.small import LINE
 
@@ -27,7 +27,7 @@ def track(line_spec: LineSpec) -> pl.DataFrame:
 
 def test_chainage_is_the_distance_along_the_rail() -> None:
     samples = build_line(spec()).samples
-    steps = distances_m(samples.latitude_deg, samples.longitude_deg, samples.height_m)
+    steps = point_distances_m(samples.latitude_deg, samples.longitude_deg, samples.height_m)
     assert steps == pytest.approx(1.0, abs=2e-6)
     assert steps.sum() == pytest.approx(5000.0, abs=1e-3)
 
@@ -74,7 +74,7 @@ def test_balises_lie_at_the_measure_of_their_element(at_m: float, element: str, 
 
 def test_survey_measures_agree_with_survey_places() -> None:
     for _, points in track(spec()).group_by("netelement_id", maintain_order=True):
-        chords = distances_m(*(points[c].to_numpy() for c in ("latitude_deg", "longitude_deg", "height_m")))
+        chords = point_distances_m(*(points[c].to_numpy() for c in ("latitude_deg", "longitude_deg", "height_m")))
         assert np.diff(points["measure_m"].to_numpy()) == pytest.approx(chords, abs=1e-3)
 
 

@@ -14,7 +14,7 @@ from datasets.infrabel import infrabel_run, infrabel_site
 from datasets.inject import inject
 from pipeline.one_run import replay
 from pipeline.stages.matching import match
-from pipeline.stages.track.geodesy import distances_m, earth_centred_m
+from pipeline.stages.track.geodesy import earth_centred_m, point_distances_m
 from schemas.config import Configuration, FixSigma, MatchingConfig, Vehicle
 from schemas.errors import InputError
 from schemas.run import RunLog, Site
@@ -39,7 +39,7 @@ def test_comma2k19_latency_and_scale_by_least_squares(car: tuple[RunLog, Site]) 
     assert run.odometer is not None
     assert run.reference is not None
     pose = [run.reference[c].to_numpy() for c in ("latitude_deg", "longitude_deg", "height_m")]
-    way = np.concatenate(([0.0], np.cumsum(distances_m(*pose))))
+    way = np.concatenate(([0.0], np.cumsum(point_distances_m(*pose))))
     pose_s, wheel_s, gnss_s = (seconds(f, run.gnss) for f in (run.reference, run.odometer, run.gnss))
     speed = run.odometer["speed_mps"].to_numpy()
     rolled = np.concatenate(([0.0], np.cumsum(0.5 * (speed[1:] + speed[:-1]) * np.diff(wheel_s))))

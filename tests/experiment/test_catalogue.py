@@ -18,7 +18,7 @@ from datasets.experiment.catalogue import (
 )
 from datasets.experiment.catalogue_faults import CatalogueFault, catalogue
 from datasets.experiment.catalogue_report import catalogue_page, faults_table, monitors_table
-from pipeline.stages.track.geodesy import distances_m
+from pipeline.stages.track.geodesy import point_distances_m
 from schemas.config import Configuration, MonitorConfig
 from schemas.run import RunLog, Site
 from schemas.tables import MONITORS
@@ -80,7 +80,11 @@ def test_the_map_is_moved_from_the_next_element_on(short: PreparedJourney, healt
     _, site = with_fault(short, FAULTS["map off to the left 5 m"])
     before, after = healthy[1].track, site.track
     off = [
-        float(distances_m(*(np.array([a[name], b[name]]) for name in ("latitude_deg", "longitude_deg", "height_m")))[0])
+        float(
+            point_distances_m(
+                *(np.array([a[name], b[name]]) for name in ("latitude_deg", "longitude_deg", "height_m"))
+            )[0]
+        )
         for a, b in zip(before.iter_rows(named=True), after.iter_rows(named=True), strict=True)
     ]
     names = before["netelement_id"].to_list()

@@ -7,7 +7,7 @@ import polars as pl
 import pytest
 
 from pipeline.one_run import replay
-from pipeline.stages.evidence import EvidenceSet, either
+from pipeline.stages.evidence import EvidenceSet, unite
 from pipeline.stages.evidence.evidence import Alternative
 from schemas.config import Configuration, Vehicle
 from schemas.run import RunLog
@@ -77,9 +77,9 @@ def test_of_two_clocks_everything_that_either_leaves_stays_possible() -> None:
         proves=np.array([True, False, False]),
         on_survey=np.array([True, False, True]),
     )
-    both = either([first, second])
+    both = unite([first, second])
     assert both.kind.tolist() == [1, -1, 1]
     assert [there.rows.tolist() for there in both.alternatives] == [[0, 2], [0, 2]]
     assert both.proves.tolist() == [True, False, False]
     assert both.on_survey.tolist() == [True, False, True]
-    assert either([first]) is first
+    assert unite([first]) is first

@@ -12,7 +12,7 @@ import pytest
 import schemas.config_judge
 from pipeline import one_run
 from pipeline.results.places import stretches_of
-from pipeline.stages.evidence.carrying import carried_forward
+from pipeline.stages.evidence.carrying import carry_from_accepted
 from pipeline.stages.judge.judgement import healthy_margins_m
 from pipeline.stages.run_row.lost_time import LostTime, remedies
 from pipeline.studies.line.spans import SpanState, spans_of, states_of
@@ -129,7 +129,7 @@ def test_an_accepted_balise_that_the_one_before_contradicts_is_no_anchor(changed
     accepted_ns, path_m, at_ns = seconds(1, 6), np.array([10.0, 120.0]), seconds(8)
 
     def low_m() -> float:
-        return float(carried_forward(accepted_ns, path_m, at_ns, counted, [], Configuration())[0][0])
+        return float(carry_from_accepted(accepted_ns, path_m, at_ns, counted, [], Configuration())[0][0])
 
     assert low_m() == pytest.approx(10.0 + 70.0 - 5.0 - 3.5)
     changed("agreement_m", 3.0)

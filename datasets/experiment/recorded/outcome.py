@@ -196,9 +196,9 @@ def _moved_m(base: Baseline, number: Ints, measure_m: Floats, row: Ints) -> tupl
     near_m = floats(base.epochs, "path_m")[row]
     leg = ints(base.epochs["leg"], 0)[row]
     at_m = np.full(number.size, np.nan)
-    for index, route in enumerate(path.routes(path.track.index)):
+    for index, route in enumerate(path.routes_by_leg(path.track.index)):
         rows = np.flatnonzero((leg == index) & (number >= 0) & np.isfinite(near_m))
-        at_m[rows], _ = route.coordinate(number[rows], measure_m[rows], near_m[rows])
+        at_m[rows], _ = route.coordinates_of(number[rows], measure_m[rows], near_m[rows])
     sense = ints(base.epochs["direction"], 1)[row]
     return (at_m - near_m) * sense, (number >= 0) & np.isfinite(near_m) & ~np.isfinite(at_m)
 

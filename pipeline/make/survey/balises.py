@@ -183,7 +183,7 @@ class _Placer:
             for number, element in enumerate(self.network.elements)
             if wanted in (None, element.name)
             for measure in measures_at(
-                element.line_km, self.track.measure_m[self.track.vertices(number)], km, self.config
+                element.line_km, self.track.measure_m[self.track.vertex_range(number)], km, self.config
             )
         ]
         if not hits:

@@ -100,7 +100,7 @@ def _doubled(ground: Network, config: SurveyConfig) -> Iterator[Finding]:
 def _open_ends(ground: Network, same_track_m: float, near_ends_m: float) -> Iterator[Finding]:
     """Ends that lie next to the middle of another element: a switch without its node. Ends near ends: `site.checks`."""
     track = ground.track
-    element, position = np.nonzero(~ground.linked_ends())
+    element, position = np.nonzero(~ground.have_successors())
     row = np.where(position == 0, track.first[element], track.first[element + 1] - 1)
     points = points_of(track.latitude_deg[row], track.longitude_deg[row])
     # Farther aside is the next track.

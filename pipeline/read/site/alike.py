@@ -13,8 +13,8 @@ from pipeline.stages.lds.crossings import DEFAULTS, expectation_window, minimal_
 from pipeline.stages.paths.candidates import candidates_of, search_about
 from pipeline.stages.paths.path_tests import offset_resolution_m, switch_resolution_m
 from pipeline.stages.track.geodesy import points_of
-from pipeline.stages.track.network import Edge, Network, network_of, surveyed
-from pipeline.stages.track.path import Chain, search, valid_along_measure
+from pipeline.stages.track.network import Edge, Network, network_of, surveyed_track
+from pipeline.stages.track.path import Chain, search_chains, valid_along_measure
 from pipeline.stages.track.segments import SAMPLE_SPACING_M
 from pipeline.stages.track.survey import SurveyedTrack, places_along
 from schemas.arrays import Floats, Ints
@@ -62,7 +62,7 @@ def window_findings(site: Site, config: LdsConfig = DEFAULTS, limits: SiteConfig
     """
     if site.balises is None:
         return []
-    network = network_of(surveyed(site), site.links)
+    network = network_of(surveyed_track(site), site.links)
     findings: dict[tuple[str, str], Finding] = {}
     for (_,), balises in site.balises.filter("linked").group_by("kind", maintain_order=True):
         points = _points(balises, network)
@@ -85,7 +85,7 @@ def _points(balises: pl.DataFrame, network: Network) -> dict[int, list[_Point]]:
             continue
         # Even runs with the measure, odd against it.
         for oriented in (2 * element + side for side, sense in ((0, 1), (1, -1)) if along in (0, sense)):
-            at_m = network.track.along_m(oriented, measure_m)
+            at_m = network.track.distance_from_entry_m(oriented, measure_m)
             points.setdefault(oriented, []).append(_Point(name, element, accuracy_m, at_m))
     return {
         oriented: sorted(on_it, key=lambda point: (point.at_m, point.balise_id)) for oriented, on_it in points.items()
@@ -118,7 +118,7 @@ def _ahead(
         return chain.oriented[-1], tuple(point.balise_id for point, _ in on_chain(chain))
 
     begin = Chain((oriented,), (-reference.at_m,))
-    for found in search(network, begin, announced_m, onward, same):
+    for found in search_chains(network, begin, announced_m, onward, same):
         if len(pair := on_chain(found.chain)) == 2:
             yield pair[0], pair[1]
 
@@ -160,7 +160,7 @@ def parallel_findings(site: Site, config: Configuration = _WHOLE) -> list[Findin
     """
     if site.route is not None:
         return []
-    network = network_of(surveyed(site), site.links)
+    network = network_of(surveyed_track(site), site.links)
     return [
         _finding(site, network, stretch, config.matching)
         for stretch in _stretches(network, config.matching)

@@ -186,7 +186,7 @@ def outward(track: SurveyedTrack) -> np.ndarray:
             near = near[away_m < SAMPLE_SPACING_M]
             at_other_end = inside[near] == other_end[near]
             for element in near[at_other_end].tolist():
-                part = surface[track.vertices(element)]
+                part = surface[track.vertex_range(element)]
                 away_m = np.linalg.norm(part - surface[end[element]], axis=1)[::step]
                 inside[element] = end[element] + step * int(np.argmax(away_m))
             near = near[~at_other_end]
@@ -214,7 +214,7 @@ def _check_elements(track: SurveyedTrack, declared_length_m: dict[str, float], c
                 text = f"the declared length is {declared[element]:.1f} m, the geometry is {length:.1f} m long"
                 collected.findings.append(Finding("warning", place, text, "Correct the measures or the geometry."))
         if chord_m[element] > collected.config.chord_m:
-            spacing = float(np.diff(geometric[track.vertices(element)]).max())
+            spacing = float(np.diff(geometric[track.vertex_range(element)]).max())
             text = f"points up to {spacing:.0f} m apart: straight lines between them leave the curve by "
             text += f"{chord_m[element]:.2f} m"
             collected.findings.append(Finding("note", place, text, "Survey curves with closer points."))

@@ -7,7 +7,7 @@ from collections import Counter
 import numpy as np
 import polars as pl
 
-from pipeline.stages.track.network import network_of, surveyed
+from pipeline.stages.track.network import network_of, surveyed_track
 from pipeline.stages.track.survey import SurveyedTrack
 from schemas.run import Finding, Site
 
@@ -17,7 +17,7 @@ def describe_site(site: Site) -> dict[str, object]:
 
     `parts` counts connected pieces of network, `switches` ends from which more than one relation leads on.
     """
-    track = surveyed(site)
+    track = surveyed_track(site)
     network = network_of(track, site.links)
     spacing = np.concatenate([np.diff(track.measure_m[part]) for _, _, part in track.elements()])
     known = track.sigma_m[np.isfinite(track.sigma_m)]
@@ -35,7 +35,7 @@ def describe_site(site: Site) -> dict[str, object]:
         "sigma_median_m": float(np.median(known)) if len(known) else None,
         "without_sigma": int(np.isnan(track.sigma_m).sum()),
         "relations": dict(sorted(Counter(site.links["navigability"].cast(str).to_list()).items())),
-        "parts": len(np.unique(network.connected)),
+        "parts": len(np.unique(network.connected_part)),
         "switches": int((branches > 1).sum()),
         "open_ends": int((branches == 0).sum()),
         "balises": dict(sorted(Counter(kinds).items())),
@@ -59,7 +59,7 @@ def without_balises(balises: pl.DataFrame | None) -> tuple[Finding, ...]:
 
 def elements_table(site: Site) -> pl.DataFrame:
     """Net elements with length [m], points, balises, and the elements a train can reach from either end."""
-    track = surveyed(site)
+    track = surveyed_track(site)
     reached: dict[tuple[str, int], list[str]] = {}
     for a, a_end, b, b_end, navigability in site.links.iter_rows():
         if navigability != "none":

@@ -7,7 +7,7 @@ import polars as pl
 from numpy.lib.stride_tricks import sliding_window_view
 
 from pipeline.read.site.alike import neighbouring_tracks, track_resolution
-from pipeline.stages.track.network import network_of, surveyed
+from pipeline.stages.track.network import network_of, surveyed_track
 from schemas.arrays import Floats
 from schemas.config import Configuration
 from schemas.run import Site
@@ -37,7 +37,7 @@ def neighbours(site: Site, config: Configuration) -> pl.DataFrame:
     """
     if site.route is not None:
         return pl.DataFrame(schema=_COLUMNS)
-    network = network_of(surveyed(site), site.links)
+    network = network_of(surveyed_track(site), site.links)
     ids = network.track.ids
     resolution = track_resolution(network.track, config.matching)
     limit_m = np.fmax(_NEIGHBOUR_M, np.fmax(resolution.by_offset_m, resolution.by_switch_m))

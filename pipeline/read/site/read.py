@@ -14,8 +14,8 @@ from pipeline.read.site.checks import drop_repeated_points, drop_scattered_point
 from pipeline.read.site.geojson import AXES_IN_DOUBT, AXES_REMEDY, GeoJsonNetwork, read_network
 from pipeline.read.site.route import route_table
 from pipeline.read.site.tables import EPSG_WGS84, RawTable, load_table, typed_table
-from pipeline.stages.track.network import surveyed
-from pipeline.stages.track.survey import SurveyedTrack, by_element, track_of
+from pipeline.stages.track.network import surveyed_track
+from pipeline.stages.track.survey import SurveyedTrack, sort_by_element, track_of
 from pipeline.storage.address import is_geojson, join, shown
 from pipeline.storage.files import is_dir, list_dir, read_bytes
 from pipeline.storage.parquet import without_checksums
@@ -84,14 +84,14 @@ def read_site(path: Path | str, config: SiteConfig = _DEFAULTS) -> Site:
         digest=_digest(files),
         files=tuple((name, len(data), hashlib.sha256(data).hexdigest()) for name, data in sorted(files.items())),
     )
-    surveyed.keep(site, track)
+    surveyed_track.keep(site, track)
     return site
 
 
 def refuse_unrelated(site: Site, place: Path | str) -> None:
     """A replay on lines that nothing joins finds the train on none of them for long. Raises `SiteError`."""
     names = [name for name, _, _ in site.files]
-    if _is_unrelated(surveyed(site).ids, site.links, names):
+    if _is_unrelated(surveyed_track(site).ids, site.links, names):
         raise SiteError(_UNRELATED, place=shown(place), remedy=_MAKE_A_SITE)
 
 
@@ -161,7 +161,7 @@ def _read_track(
     if frame.is_empty():
         breaches.append(f"{raw.file}: has no points of net elements")
         return None, network, []
-    frame = by_element(to_wgs84(raw, frame, config, breaches))
+    frame = sort_by_element(to_wgs84(raw, frame, config, breaches))
     frame, notes = drop_repeated_points(raw.file, frame, breaches)
     frame, scattered = drop_scattered_points(raw.file, frame)
     notes += scattered
@@ -255,9 +255,9 @@ def _with_measures(file: str, frame: pl.DataFrame, breaches: list[str]) -> tuple
         if missing[element]:
             breaches.append(f"{file}: column measure_m: element {name} has a measure at some points only")
         else:
-            at = int(np.argmax(falls[track.vertices(element)]))
+            at = int(np.argmax(falls[track.vertex_range(element)]))
             measure_m = track.measure_m[start[element] + at]
             text = f"element {name} does not increase at point {at} ({measure_m:g} m)"
             breaches.append(f"{file}: column measure_m: {text}")
-    measured = track.measured(np.where(np.repeat(missing > 0, points), track.geometric_m, track.measure_m))
+    measured = track.with_measures(np.where(np.repeat(missing > 0, points), track.geometric_m, track.measure_m))
     return frame.with_columns(measure_m=pl.Series(measured.measure_m)), measured

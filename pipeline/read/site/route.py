@@ -9,7 +9,7 @@ import polars as pl
 
 from pipeline.read.site.checks import route_breaches
 from pipeline.read.site.tables import load_table, typed_table
-from pipeline.stages.track.network import surveyed
+from pipeline.stages.track.network import surveyed_track
 from pipeline.storage.address import Address, name_of, shown
 from pipeline.storage.files import read_bytes
 from schemas.config import SiteConfig
@@ -49,7 +49,7 @@ def with_route(site: Site, address: Address, config: SiteConfig) -> Site:
     breaches: list[str] = []
     route = route_table(name_of(address), data, breaches)
     if route is not None and not breaches:
-        breaches = route_breaches(surveyed(site), route, config)
+        breaches = route_breaches(surveyed_track(site), route, config)
     if route is None or breaches:
         remedy = "Correct the route; `balise replay --write-route` writes the route that was found."
         raise InputError("; ".join(breaches), place=shown(address), remedy=remedy)

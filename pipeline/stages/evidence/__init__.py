@@ -8,8 +8,8 @@ are known at which instants: `anchors`. What contradicts a reference: `contradic
 the odometer carry them: `carrying`. Which chains of net elements lead from one to the next: `gaps`.
 """
 
-from pipeline.stages.evidence.evidence import EvidenceSet, TrainEvidence, either
+from pipeline.stages.evidence.evidence import EvidenceSet, TrainEvidence, unite
 from pipeline.stages.evidence.gathering import evidence_of
 from pipeline.stages.evidence.places import TruePlaces, true_places
 
-__all__ = ["EvidenceSet", "TrainEvidence", "TruePlaces", "either", "evidence_of", "true_places"]
+__all__ = ["EvidenceSet", "TrainEvidence", "TruePlaces", "unite", "evidence_of", "true_places"]

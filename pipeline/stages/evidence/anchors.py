@@ -1,4 +1,4 @@
-"""Places that are known of the train: stretches of a reference, balise reads, stands."""
+"""Places that are known of the train: stretches of a reference, balise reads, standstills at the end of a recording."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import numpy as np
 import polars as pl
 
 from pipeline.stages.evidence.carrying import RecorderClock, SignedOdometer, TrueAnchor
-from pipeline.stages.evidence.contradictions import KnownPath, Levels, median_along
+from pipeline.stages.evidence.contradictions import KnownPath, Levels, running_median
 from pipeline.stages.odometry import Odometry
 from pipeline.stages.odometry.polarity import relative_sense, shared_movement_m
 from pipeline.stages.odometry.scale_lag import spans_of_rows
@@ -28,7 +28,7 @@ _STANDSTILL_S = 2.0
 _STANDS_S = 1.0
 
 
-class Stand(NamedTuple):
+class FinalStand(NamedTuple):
     """The last instant of a recording at which the train stood [ns]."""
 
     last_ns: int
@@ -36,10 +36,10 @@ class Stand(NamedTuple):
 
 def final_stands(
     reference: Sequence[ReferenceStretch], odometers: Sequence[Odometry], config: Configuration
-) -> tuple[Stand, ...]:
+) -> tuple[FinalStand, ...]:
     """The ends of independent odometers and of the reference at which the train had stood for two seconds.
 
-    Of several recordings the one that ends last counts: the others may have lost a train that drove on.
+    Of several recordings the one that ends last counts: the others may have lost a train that drove on. One or none.
     """
     ends: list[tuple[int, bool]] = []
     for odometer in odometers:
@@ -57,10 +57,10 @@ def final_stands(
     if not ends:
         return ()
     last_ns, standing = max(ends)
-    return (Stand(last_ns),) if standing else ()
+    return (FinalStand(last_ns),) if standing else ()
 
 
-def still_standing(t_ns: Ints, stands: Sequence[Stand], config: Configuration) -> tuple[Ints, Floats]:
+def held_at_stands(t_ns: Ints, stands: Sequence[FinalStand], config: Configuration) -> tuple[Ints, Floats]:
     """The instants, those within a second after a stand put at its end, and how far the train may have come [m]."""
     held_ns = t_ns.copy()
     slack_m = np.zeros(t_ns.size)
@@ -96,14 +96,14 @@ class KnownStretch:
     disputed: tuple[tuple[int, int], ...] = ()
 
     def proved_at(self, t_ns: Ints) -> Bools:
-        """Whether the samples about each instant are."""
+        """Whether the samples about each instant show that the track is one of the survey."""
         after = np.searchsorted(self.t_ns, t_ns).clip(0, self.t_ns.size - 1)
         before = np.maximum(after - 1, 0)
         proved: Bools = self.proved[after] & (self.proved[before] | (self.t_ns[after] == t_ns))
         return proved
 
     def anchor(self, sample: int) -> TrueAnchor:
-        """The places of one sample; what a step left open widens it like the clock."""
+        """The places of one sample as an anchor; what a step left open widens it like the clock."""
         open_m = max(float((known.high_m - known.low_m)[sample]) for known in self.paths)
         return TrueAnchor(
             t_ns=int(self.t_ns[sample]),
@@ -125,32 +125,32 @@ class KnownStretch:
         """The times of these samples, ends left out."""
         return [(int(self.t_ns[first]) - 1, int(self.t_ns[last]) + 1) for first, last in spans_of(self.doubtful)]
 
-    def trusted(self) -> list[KnownStretch]:
+    def without_doubtful(self) -> list[KnownStretch]:
         """The parts without doubtful samples."""
         if not self.doubtful.any():
             return [self]
-        return [self._part(slice(first, last + 1)) for first, last in spans_of(~self.doubtful) if last > first]
+        return [self._some_rows(slice(first, last + 1)) for first, last in spans_of(~self.doubtful) if last > first]
 
-    def _part(self, rows: slice) -> KnownStretch:
+    def _some_rows(self, rows: slice) -> KnownStretch:
         """The same stretch, with some of its rows only."""
         return replace(
             self,
             t_ns=self.t_ns[rows],
             sigma_m=self.sigma_m[rows],
             clock_m=self.clock_m[rows],
-            paths=tuple(known.part(rows) for known in self.paths),
+            paths=tuple(known.some_rows(rows) for known in self.paths),
             proved=self.proved[rows],
         )
 
-    def ends(self, counter: SignedOdometer) -> tuple[TrueAnchor, TrueAnchor]:
-        """The outermost samples at which the odometer counted: only from these is a place carried."""
+    def end_anchors(self, counter: SignedOdometer) -> tuple[TrueAnchor, TrueAnchor]:
+        """First and last sample at which the odometer counted; only from these is a place carried."""
         counted = np.flatnonzero(counter.odometer.known_at(self.t_ns))
         first, last = (counted if counted.size else np.arange(self.t_ns.size))[[0, -1]].tolist()
         return self.anchor(first), self.anchor(last)
 
 
 @frozen
-class Sided:
+class OrientedStretch:
     """A stretch with the sense of its first path: metres that the odometer counted with it and against it."""
 
     stretch: ReferenceStretch
@@ -159,7 +159,7 @@ class Sided:
     against_m: float
 
     def anchor(self, sample: int) -> TrueAnchor:
-        """The places of one sample, by its own clock."""
+        """The places of one sample as an anchor, by its own clock."""
         paths = self.stretch.paths
         places = [path.legs[int(path.leg[sample])].locate(path.at_m[[sample]]) for path in paths]
         return TrueAnchor(
@@ -170,20 +170,20 @@ class Sided:
         )
 
     @property
-    def first_oriented(self) -> int:
+    def first_oriented_element(self) -> int:
         """The oriented net element of the first sample, in the sense in which the odometer counts up."""
         path = self.stretch.paths[0]
         element, _, sense = path.legs[int(path.leg[0])].locate(path.at_m[:1])
         return 2 * int(element[0]) + int(sense[0] * self.sense < 0)
 
 
-def sided(stretch: ReferenceStretch, counter: SignedOdometer | None, least_m: float) -> Sided:
-    """The sense in which the odometer counts along the path: by the first movement of `least_m` (DOMAIN section 2).
+def orient_stretch(stretch: ReferenceStretch, counter: SignedOdometer | None, least_m: float) -> OrientedStretch:
+    """The stretch with the sense in which the odometer counts along it: by the first movement of `least_m` (DOMAIN 2).
 
     Movements of the reference beyond its noise tell, where the odometer counted about as much: a reference that stands
     or creeps while the odometer counts has no direction to give.
     """
-    begin, end, step_m = _movements(stretch)
+    begin, end, step_m = _movements_beyond_noise(stretch)
     counted_m = np.abs(step_m)
     if counter is not None:
         counted_m = counter.odometer.proved_between(stretch.t_ns[begin], stretch.t_ns[end])
@@ -191,11 +191,11 @@ def sided(stretch: ReferenceStretch, counter: SignedOdometer | None, least_m: fl
     sense = relative_sense(counted_m, step_m, least_m)
     shared_m = sense * shared_movement_m(counted_m, step_m)
     with_m, against_m = (float((sign * shared_m).clip(min=0.0).sum()) for sign in (1, -1))
-    return Sided(stretch, sense, with_m, against_m)
+    return OrientedStretch(stretch, sense, with_m, against_m)
 
 
-def _movements(stretch: ReferenceStretch) -> tuple[Ints, Ints, Floats]:
-    """Pairs of samples, a second or more apart, between which the reference moved beyond its noise, and how far [m]."""
+def _movements_beyond_noise(stretch: ReferenceStretch) -> tuple[Ints, Ints, Floats]:
+    """Pairs of samples, a second apart or more, between which the reference moved beyond its noise; how far [m]."""
     t_ns = stretch.t_ns
     instants = np.arange(int(t_ns[0]), int(t_ns[-1]) + 1, NS_PER_S, dtype=np.int64)
     rows = np.unique(np.searchsorted(t_ns, instants)).tolist()
@@ -227,7 +227,7 @@ def _on_one_leg(stretch: ReferenceStretch, begin: Ints, end: Ints) -> tuple[Ints
 
 
 def reference_movements(
-    sides: Sequence[Sided], lengths_m: Callable[[TrueAnchor, TrueAnchor], list[float]]
+    sides: Sequence[OrientedStretch], lengths_m: Callable[[TrueAnchor, TrueAnchor], list[float]]
 ) -> tuple[Ints, Ints, Floats, Floats]:
     """Movements of the reference between its stamps, as the odometer counts up: begin and end [ns], length and sigma
     [m].
@@ -250,11 +250,11 @@ def reference_movements(
     return begins, ends, lengths, sigmas
 
 
-def shown_on_its_track(stretch: ReferenceStretch, config: Configuration) -> Bools:
+def exclude_other_tracks(stretch: ReferenceStretch, config: Configuration) -> Bools:
     """Samples that no neighbouring track can have made, whether the survey holds it or not (DOMAIN section 5.0).
 
-    By the median over 200 m about each the reference lies within the spacing of tracks, less k roots, of its track; per
-    sample, of the worst of the paths.
+    By the median over 200 m about each the reference lies within the spacing of tracks, less k combined sigmas, of its
+    track; per sample, of the worst of the paths.
     """
     if config.evidence.survey_complete:
         return np.ones(stretch.t_ns.size, dtype=np.bool_)
@@ -262,7 +262,7 @@ def shown_on_its_track(stretch: ReferenceStretch, config: Configuration) -> Bool
     for path in stretch.paths:
         spare_m = config.evidence.track_spacing_m - config.hazards.evidence_factor * path.root_m
         run_m = np.concatenate([[0.0], np.cumsum(np.abs(np.diff(path.at_m)))])
-        proved &= median_along(path.aside_m, run_m, config.evidence.survey_window_m) <= median_along(
+        proved &= running_median(path.aside_m, run_m, config.evidence.survey_window_m) <= running_median(
             spare_m, run_m, config.evidence.survey_window_m
         )
     return proved
@@ -275,7 +275,7 @@ def read_anchors(
     if reads is None or balises is None or reads.is_empty():
         return []
     physical = balises.filter(pl.col("kind").cast(pl.String) == BaliseKind.PHYSICAL.value)
-    rows, elements = track.holding(physical)
+    rows, elements = track.elements_holding(physical)
     known = physical[rows].select("balise_id", "measure_m", element=elements)
     read = reads.select("t", "balise_id").join(known, on="balise_id").sort("t", "balise_id")
     return [
@@ -284,8 +284,10 @@ def read_anchors(
     ]
 
 
-def on_clock(anchors: Sequence[TrueAnchor], clock: RecorderClock, counter: SignedOdometer | None) -> list[TrueAnchor]:
-    """Anchors on the odometer's clock, with what their own may add at their speed; nothing without an odometer."""
+def put_on_clock(
+    anchors: Sequence[TrueAnchor], clock: RecorderClock, counter: SignedOdometer | None
+) -> list[TrueAnchor]:
+    """Anchors on the odometer's clock, with what their own clock may add at their speed; 0 without an odometer."""
     t_ns = np.array([anchor.t_ns for anchor in anchors], dtype=np.int64)
     speed_mps = np.zeros(t_ns.size) if counter is None else np.abs(counter.odometer.speed_about(t_ns))
     clock_m = clock.delta_s * speed_mps
@@ -296,7 +298,7 @@ def on_clock(anchors: Sequence[TrueAnchor], clock: RecorderClock, counter: Signe
     ]
 
 
-def outside(anchors: Sequence[TrueAnchor], stretches: Sequence[KnownStretch]) -> list[TrueAnchor]:
+def anchors_outside(anchors: Sequence[TrueAnchor], stretches: Sequence[KnownStretch]) -> list[TrueAnchor]:
     """Anchors at times that no stretch covers."""
     spans = [stretch.t_ns[[0, -1]].tolist() for stretch in stretches]
     return [anchor for anchor in anchors if not any(begin <= anchor.t_ns <= end for begin, end in spans)]

@@ -10,7 +10,7 @@ from typing import Self
 import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 
-from pipeline.stages.evidence.carrying import Lags, SignedOdometer, clock_of
+from pipeline.stages.evidence.carrying import Lags, SignedOdometer, recorder_clock
 from pipeline.stages.odometry.polarity import relative_sense
 from pipeline.stages.odometry.regression import ScaleLag
 from pipeline.stages.reference import ReferencePath, ReferenceStretch
@@ -45,10 +45,10 @@ class KnownPath:
     high_m: Floats
     step_m: Floats
 
-    def part(self, rows: slice) -> KnownPath:
+    def some_rows(self, rows: slice) -> KnownPath:
         """The same, of some samples only."""
         arrays = {name: getattr(self, name)[rows] for name in ("at_m", "low_m", "high_m", "step_m")}
-        return replace(self, path=self.path.part(rows), **arrays)
+        return replace(self, path=self.path.some_rows(rows), **arrays)
 
     def place(self, sample: int) -> Place:
         """Net element and measure of one sample."""
@@ -57,7 +57,7 @@ class KnownPath:
 
 
 def path_speed_mps(t_ns: Ints, at_m: Floats, leg: Ints) -> Floats:
-    """Speed over a second about each sample."""
+    """Speed over a second about each sample [m/s]."""
     half_ns = NS_PER_S // 2
     end = np.minimum(np.searchsorted(t_ns, t_ns + half_ns), t_ns.size - 1)
     # A slow log has no other sample within the second before its last one.
@@ -68,7 +68,7 @@ def path_speed_mps(t_ns: Ints, at_m: Floats, leg: Ints) -> Floats:
 
 @frozen
 class ReferenceStep:
-    """From one sample to the next the reference moves by `step_m` more than every odometer; more than `noise_m`.
+    """From sample `sample` to the next the reference moves by `step_m` more than every odometer, and than `noise_m`.
 
     `span`: samples over which it drifted by so much, where it was no step; `leap`: no odometer says so, but no train
     can drive it.
@@ -96,15 +96,14 @@ class Witness:
     scale_sigma: float = 0.0
 
     @classmethod
-    def of(cls, counter: SignedOdometer, lags: Lags, config: Configuration) -> Self:
-        """Scale by the vehicle file, else as measured with the lag, else within 5 % (SUBSET-041 5.3.1.1)."""
+    def with_measured_scale(cls, counter: SignedOdometer, lags: Lags, config: Configuration) -> Self:
+        """The odometer with its scale by the vehicle file, else as measured, else within 5 % (SUBSET-041 5.3.1.1)."""
         factor = config.hazards.evidence_factor
         share = config.lds.odometer_share
-        clock = clock_of([lags], independent=True, config=config.hazards)
-        if counter.by_file:
-            return cls(
-                counter, clock.shift_s, clock.delta_s
-            )  # the variance of a distance holds that of the file's scale
+        clock = recorder_clock([lags], independent=True, config=config.hazards)
+        if counter.has_known_scale:
+            # The variance of a distance holds that of the file's scale.
+            return cls(counter, clock.shift_s, clock.delta_s)
         best = min(lags.found, key=lambda lag: lag.scale_sigma, default=ScaleLag())
         if factor * best.scale_sigma < share:
             return cls(counter, clock.shift_s, clock.delta_s, best.scale, best.scale_sigma)
@@ -112,7 +111,7 @@ class Witness:
         return cls(counter, clock.shift_s, clock.delta_s, 1.0, share / config.align.sure_sigmas)
 
 
-def contradictions(
+def find_contradictions(
     known: KnownPath, stretch: ReferenceStretch, witnesses: Sequence[Witness], config: Configuration
 ) -> list[ReferenceStep]:
     """Steps that no train can drive, or that an odometer contradicts by more than k_T sigmas, over 10 s and 100 s too.
@@ -127,10 +126,10 @@ def contradictions(
         return []
     rows = np.arange(t_ns.size)
     nothing_m = np.zeros(t_ns.size - 1)
-    step_m, limit_m = _contradicted(known, stretch, witnesses, (rows[:-1], rows[1:]), nothing_m, config)
-    leap_m, leap_limit_m = _undrivable_m(known, stretch, config)
+    step_m, limit_m = _differences_m(known, stretch, witnesses, (rows[:-1], rows[1:]), nothing_m, config)
+    leap_m, leap_limit_m = _beyond_driving_m(known, stretch, config)
     contradicted = np.abs(step_m) > limit_m
-    contradicted[contradicted] = (_unexplained_m(known.at_m, t_ns, limit_m) != 0.0)[contradicted]
+    contradicted[contradicted] = (_beyond_speed_m(known.at_m, t_ns, limit_m) != 0.0)[contradicted]
     step_m = np.where(contradicted, step_m, leap_m)
     limit_m = np.where(contradicted, limit_m, leap_limit_m)
     stepped = np.flatnonzero(step_m)
@@ -144,14 +143,14 @@ def contradictions(
         (_WINDOW_S, 0.0, 0.0),
         *((_LONG_WINDOW_S, late_s, config.lds.odometer_fixed_m) for late_s in _BEGUN_S),
     ):
-        found = _drifts(known, stretch, witnesses, np.cumsum(gathered_m), window, config)
+        found = _find_drifts(known, stretch, witnesses, np.cumsum(gathered_m), window, config)
         for step in found:
             gathered_m[step.sample + 1] += step.step_m
         steps += found
     return sorted(steps, key=lambda step: step.sample)
 
 
-def _drifts(
+def _find_drifts(
     known: KnownPath,
     stretch: ReferenceStretch,
     witnesses: Sequence[Witness],
@@ -159,7 +158,7 @@ def _drifts(
     window: tuple[float, float, float],
     config: Configuration,
 ) -> list[ReferenceStep]:
-    """Windows that an odometer contradicts beyond `explained_m` of steps.
+    """Windows in which an odometer contradicts the reference by more than the steps explain (`explained_m`).
 
     `window`: length, first begin [s], and what an odometer may be off whatever it counted [m]. Next to one that is
     contradicted the reference may have drifted already, or still, where no odometer counted.
@@ -173,7 +172,7 @@ def _drifts(
     if begin.size == 0:
         return []
     explained_m = explained_m[end] - explained_m[begin]
-    rest_m, allowed_m = _contradicted(known, stretch, witnesses, (begin, end), explained_m, config)
+    rest_m, allowed_m = _differences_m(known, stretch, witnesses, (begin, end), explained_m, config)
     allowed_m += fixed_m
     counted = np.flatnonzero(np.isfinite(allowed_m))
     steps: list[ReferenceStep] = []
@@ -194,9 +193,10 @@ def _drifts(
 
 @frozen
 class Levels:
-    """The samples between steps that last, with how high each lies over the first; `confirmed` by a read.
+    """The samples between lasting steps of a reference, with how high each level lies over the first one [m].
 
-    `drifts`: the step before it is a drift of unknown size; `spikes`: steps that lead back to where they began.
+    `confirmed`: by a read. `drifts`: the step before it is a drift of unknown size; `spikes`: steps that lead back to
+    where they began.
     """
 
     rows: tuple[slice, ...]
@@ -206,9 +206,9 @@ class Levels:
     spikes: tuple[tuple[ReferenceStep, ReferenceStep], ...] = ()
 
     @classmethod
-    def of(cls, steps: Sequence[ReferenceStep], t_ns: Ints, reads_ns: Sequence[int]) -> Levels:
+    def between_steps(cls, steps: Sequence[ReferenceStep], t_ns: Ints, reads_ns: Sequence[int]) -> Levels:
         """The levels between steps of a reference; reads confirm those that they lie in."""
-        lasting, spikes = _without_spikes(steps, t_ns)
+        lasting, spikes = _part_spikes(steps, t_ns)
         heard = np.searchsorted(t_ns, np.array(reads_ns, dtype=np.int64))
         begins = [(step.sample + 1, step.step_m, step.span is not None) for step in lasting]
         for leap in (step for step in lasting if step.leap):
@@ -224,12 +224,15 @@ class Levels:
         return cls(tuple(rows), heights_m, confirmed, drifts, tuple(spikes))
 
     def oriented(self, sense: int) -> Levels:
-        """The levels as the odometer counts up, or back along the path."""
+        """The same with heights as the odometer counts up (`sense` +1), or back along the path (-1)."""
         return replace(self, heights_m=sense * self.heights_m)
 
     @property
-    def doubts(self) -> int:
-        """Steps of which no read says which side was right; between two confirmed levels the odometer failed."""
+    def count_doubted_steps(self) -> int:
+        """Number of steps of which no read says which side was right.
+
+        Between two confirmed levels the odometer failed.
+        """
         return int((~(self.confirmed[:-1] & self.confirmed[1:])).sum())
 
     @property
@@ -239,7 +242,7 @@ class Levels:
 
 
 @frozen
-class Beyond:
+class LevelsBeyond:
     """Levels of the reference before and after a stretch, up to one that a read confirms: how high they lie [m].
 
     `before_m` over its first level, `after_m` over its last one, as the odometer counts up; NaN: nobody knows.
@@ -248,15 +251,15 @@ class Beyond:
     before_m: tuple[float, ...] = ()
     after_m: tuple[float, ...] = ()
 
-    def oriented(self, sense: int) -> Beyond:
-        """The levels as the odometer counts up, or back along the path."""
-        return Beyond(tuple(sense * m for m in self.before_m), tuple(sense * m for m in self.after_m))
+    def oriented(self, sense: int) -> LevelsBeyond:
+        """The same with heights as the odometer counts up (`sense` +1), or back along the path (-1)."""
+        return LevelsBeyond(tuple(sense * m for m in self.before_m), tuple(sense * m for m in self.after_m))
 
 
-def left_open(
-    known: KnownPath, t_ns: Ints, steps: Sequence[ReferenceStep], levels: Levels, beyond: Beyond
+def open_for_steps(
+    known: KnownPath, t_ns: Ints, steps: Sequence[ReferenceStep], levels: Levels, beyond: LevelsBeyond
 ) -> KnownPath:
-    """The path with how far behind and ahead of each sample the train may be after and before steps of the reference.
+    """The path with how far behind and ahead of each sample the train may be, because the reference stepped.
 
     Which side of a step was right nobody knows: both are possible, forward and backward, as far as the next level that
     a read confirms; without end after a drift, whose size nobody knows. Two steps that cancel each other within ten
@@ -276,7 +279,7 @@ def left_open(
         low_m[part] = np.minimum(low_m[part], behind_m)
         high_m[part] = np.maximum(high_m[part], ahead_m)
     for number in np.flatnonzero(~levels.confirmed).tolist():
-        behind_m = levels.heights_m[number] - _possible_m(levels, number, beyond)
+        behind_m = levels.heights_m[number] - _possible_levels_m(levels, number, beyond)
         unknown = bool(np.isnan(behind_m).any())
         rows = levels.rows[number]
         low_m[rows] -= np.inf if unknown else behind_m.max()
@@ -289,7 +292,7 @@ def left_open(
     return replace(known, low_m=known.at_m + low_m, high_m=known.at_m + high_m, step_m=open_step_m)
 
 
-def _possible_m(levels: Levels, number: int, beyond: Beyond) -> Floats:
+def _possible_levels_m(levels: Levels, number: int, beyond: LevelsBeyond) -> Floats:
     """Levels at which the reference may have been right when it was at this one [m]; NaN where a drift lies between."""
     first = number
     while first > 0 and not levels.confirmed[first]:
@@ -305,15 +308,15 @@ def _possible_m(levels: Levels, number: int, beyond: Beyond) -> Floats:
     return np.concatenate([group, before_m, levels.heights_m[-1] + np.array(after_m)])
 
 
-def levels_beyond(stretches: Sequence[Levels], steps_m: Sequence[float]) -> list[Beyond]:
+def levels_beyond(stretches: Sequence[Levels], steps_m: Sequence[float]) -> list[LevelsBeyond]:
     """The levels on both sides of each stretch; `steps_m`: of the reference in the gaps between them."""
     reversed_steps = [-step_m for step_m in reversed(steps_m)]
-    before = _behind(stretches, steps_m, back=False)
-    after = _behind(stretches[::-1], reversed_steps, back=True)[::-1]
-    return [Beyond(tuple(was), tuple(comes)) for was, comes in zip(before, after, strict=True)]
+    before = _levels_before_m(stretches, steps_m, back=False)
+    after = _levels_before_m(stretches[::-1], reversed_steps, back=True)[::-1]
+    return [LevelsBeyond(tuple(was), tuple(comes)) for was, comes in zip(before, after, strict=True)]
 
 
-def _behind(stretches: Sequence[Levels], steps_m: Sequence[float], back: bool) -> list[list[float]]:
+def _levels_before_m(stretches: Sequence[Levels], steps_m: Sequence[float], back: bool) -> list[list[float]]:
     """The levels of all stretches before each, in this order, over its near end [m]."""
     behind: list[list[float]] = []
     seen_levels_m: list[float] = []
@@ -337,10 +340,10 @@ def _behind(stretches: Sequence[Levels], steps_m: Sequence[float], back: bool) -
     return [list(dict.fromkeys(heights_m)) for heights_m in behind]
 
 
-def _without_spikes(
+def _part_spikes(
     steps: Sequence[ReferenceStep], t_ns: Ints
 ) -> tuple[list[ReferenceStep], list[tuple[ReferenceStep, ReferenceStep]]]:
-    """The steps that last, and pairs that lead back to where they began."""
+    """The steps that last, and the pairs of steps that lead back to where they began."""
     lasting: list[ReferenceStep] = []
     spikes: list[tuple[ReferenceStep, ReferenceStep]] = []
     for step in steps:
@@ -356,7 +359,7 @@ def _without_spikes(
     return lasting, spikes
 
 
-def _unexplained_m(at_m: Floats, t_ns: Ints, least_m: Floats) -> Floats:
+def _beyond_speed_m(at_m: Floats, t_ns: Ints, least_m: Floats) -> Floats:
     """How far each step leads beyond the speed of the 2 s before and after it, as the median has it [m].
 
     0 where that is `least_m` at most: such a step a train may drive, however its odometer fails.
@@ -373,17 +376,17 @@ def _unexplained_m(at_m: Floats, t_ns: Ints, least_m: Floats) -> Floats:
     return np.where(np.abs(beyond_m) > least_m, beyond_m, 0.0)
 
 
-def _undrivable_m(known: KnownPath, stretch: ReferenceStretch, config: Configuration) -> tuple[Floats, Floats]:
-    """How far each step of the reference leads beyond what a train can drive, else 0; and what is allowed."""
+def _beyond_driving_m(known: KnownPath, stretch: ReferenceStretch, config: Configuration) -> tuple[Floats, Floats]:
+    """How far each step of the reference leads beyond what a train can drive, else 0 [m]; and what is allowed [m]."""
     dt_s = np.diff(stretch.t_ns) / NS_PER_S
     root_m = np.hypot(stretch.sigma_m[1:], stretch.sigma_m[:-1])
     driven_m = config.align.braking_mps2 * np.maximum(dt_s, EVEN_S) * dt_s
     allowed_m = config.align.sure_sigmas * root_m + driven_m
     same_leg = np.diff(known.path.leg) == 0
-    return np.where(same_leg, _unexplained_m(known.at_m, stretch.t_ns, allowed_m), 0.0), allowed_m
+    return np.where(same_leg, _beyond_speed_m(known.at_m, stretch.t_ns, allowed_m), 0.0), allowed_m
 
 
-def _contradicted(
+def _differences_m(
     known: KnownPath,
     stretch: ReferenceStretch,
     witnesses: Sequence[Witness],
@@ -391,10 +394,10 @@ def _contradicted(
     explained_m: Floats,
     config: Configuration,
 ) -> tuple[Floats, Floats]:
-    """Per pair of samples: its difference, less what is explained, from the odometer that contradicts it most [m].
+    """Per pair of samples: how far the reference differs from the odometer that contradicts it most [m], and its limit.
 
-    And what is allowed: k_T sigmas, the clock at a change of speed, and what the odometer itself doubts of its
-    distance. `stretch`: with the stamps of the reference; each is compared at the lag that was measured.
+    Less what is explained. The limit: k_T sigmas, the clock at a change of speed, and what the odometer itself doubts
+    of its distance. `stretch`: with the stamps of the reference; each is compared at the lag that was measured.
     """
     begin, end = pairs
     moved_m = known.at_m[end] - known.at_m[begin]
@@ -425,8 +428,8 @@ def _contradicted(
     return rest_m, allowed_m
 
 
-def median_along(values: Floats, distance_m: Floats, window_m: float) -> Floats:
-    """Median over `window_m` of the distance about each sample, taken every quarter of it; over 5 samples at least."""
+def running_median(values: Floats, distance_m: Floats, window_m: float) -> Floats:
+    """Median over `window_m` of the distance about each sample, every quarter of it, of 5 samples at least."""
     if not np.any(values != values[:1]):
         return values
     places_m = np.arange(distance_m[0], distance_m[-1] + 0.25 * window_m, 0.25 * window_m)

@@ -11,36 +11,36 @@ import polars as pl
 
 from pipeline.stages.evidence.anchors import (
     KnownStretch,
-    Sided,
+    OrientedStretch,
+    anchors_outside,
+    exclude_other_tracks,
     final_stands,
-    on_clock,
-    outside,
+    orient_stretch,
+    put_on_clock,
     reference_movements,
-    shown_on_its_track,
-    sided,
 )
 from pipeline.stages.evidence.carrying import (
     Lags,
     RecorderClock,
     SignedOdometer,
     TrueAnchor,
-    clocks_of,
-    lags_of,
-    true_clocks_s,
+    measure_lags,
+    possible_leads_s,
+    recorder_clocks,
 )
 from pipeline.stages.evidence.contradictions import (
     EVEN_S,
-    Beyond,
     KnownPath,
     Levels,
+    LevelsBeyond,
     Witness,
-    contradictions,
-    left_open,
+    find_contradictions,
     levels_beyond,
+    open_for_steps,
     path_speed_mps,
 )
 from pipeline.stages.evidence.evidence import Span, TrainEvidence
-from pipeline.stages.evidence.gaps import Carried, GapSearch
+from pipeline.stages.evidence.gaps import CarriedGaps, GapSearch
 from pipeline.stages.odometry import Odometry
 from pipeline.stages.reference import ReferenceStretch
 from pipeline.stages.track.network import Network
@@ -49,7 +49,7 @@ from schemas.config import Configuration, HazardConfig, Vehicle
 from schemas.enums import Origin
 
 
-def on_time(stream: pl.DataFrame | None, latency_s: float) -> pl.DataFrame | None:
+def without_latency(stream: pl.DataFrame | None, latency_s: float) -> pl.DataFrame | None:
     """The stream with its declared lag taken off (vehicle file, `reference_latency_s`, `reads_latency_s`)."""
     if stream is None or latency_s == 0.0:
         return stream
@@ -85,20 +85,21 @@ def without_frozen(
 _EVER_NS = 2**62
 
 
-def known_stretch(
-    side: Sided,
+def stretch_as_evidence(
+    side: OrientedStretch,
     clock: RecorderClock,
     witnesses: Sequence[Witness],
     reads: Sequence[TrueAnchor],
     ahead_m: float,
     config: Configuration,
-    beyond: Beyond | None = None,
+    beyond: LevelsBeyond | None = None,
 ) -> KnownStretch:
-    """The stretch as evidence; `reads` close a step of the reference where they confirm it.
+    """A stretch of the reference as evidence: on the odometer's clock, opened for its steps, less disputed reads.
 
-    `beyond`: what the reference does on both sides of the stretch.
+    `reads` close a step where they confirm the reference; `ahead_m`: of the antenna; `beyond`: the levels of the
+    reference on both sides of the stretch.
     """
-    beyond = beyond or Beyond()
+    beyond = beyond or LevelsBeyond()
     t_ns = side.stretch.t_ns - round(clock.shift_s * NS_PER_S)
     stretch = replace(side.stretch, t_ns=t_ns)
     paths: list[KnownPath] = []
@@ -114,13 +115,13 @@ def known_stretch(
         # A clock that leaves more than half the failure limit open lets a read confirm nothing.
         most_m = config.hazards.limits.confirming_m
         reads_ns = _confirming_ns(known, stretch, clock_m, reads, config.hazards.evidence_factor, most_m)
-        steps = contradictions(known, side.stretch, witnesses, config)
-        of_path = Levels.of(steps, t_ns, reads_ns)
+        steps = find_contradictions(known, side.stretch, witnesses, config)
+        of_path = Levels.between_steps(steps, t_ns, reads_ns)
         levels.append(of_path.oriented(side.sense))
-        opened = left_open(known, t_ns, steps, of_path, beyond.oriented(side.sense))
+        opened = open_for_steps(known, t_ns, steps, of_path, beyond.oriented(side.sense))
         paths.append(opened)
         possible_ns |= set(_confirming_ns(opened, stretch, clock_m, reads, config.align.sure_sigmas, np.inf))
-    disputed = _disputed(t_ns, reads, possible_ns)
+    disputed = _disputed_spans(t_ns, reads, possible_ns)
     for first_ns, last_ns in [] if witnesses else disputed:
         # Nothing is carried from the reads, so nobody knows since when the reference has been off.
         open_m = np.where((t_ns >= first_ns) & (t_ns <= last_ns), np.inf, 0.0)
@@ -132,7 +133,7 @@ def known_stretch(
     lates_s = np.linspace(-clock.delta_s, clock.delta_s, 3 + 2 * int(clock.delta_s / EVEN_S))
     around = [np.interp(since_s + late_s, since_s, speed_mps) for late_s in lates_s.tolist()]
     clock_m = np.maximum.reduce(around) * clock.delta_s
-    proved = shown_on_its_track(stretch, config)
+    proved = exclude_other_tracks(stretch, config)
     return KnownStretch(
         t_ns,
         stretch.sigma_m,
@@ -146,7 +147,7 @@ def known_stretch(
     )
 
 
-def _disputed(t_ns: Ints, reads: Sequence[TrueAnchor], possible_ns: set[int]) -> list[tuple[int, int]]:
+def _disputed_spans(t_ns: Ints, reads: Sequence[TrueAnchor], possible_ns: set[int]) -> list[tuple[int, int]]:
     """The time between the neighbours of each read at which the train was on none of the stretch's paths.
 
     Which of the two was right nobody knows, nor since when: without end where no read confirms the reference.
@@ -169,9 +170,9 @@ def _confirming_ns(
     factor: float,
     most_m: float,
 ) -> list[int]:
-    """Times of reads at balises where the reference may have been, within `factor` sigmas of both and both clocks.
+    """Times [ns] of reads at balises where the reference may have been, within `factor` sigmas and both clocks.
 
-    Not where these are more than `most_m`.
+    Only where these leave no more than `most_m` open.
     """
     t_ns = stretch.t_ns
     since_ns = (t_ns - t_ns[0]).astype(np.float64)
@@ -188,7 +189,7 @@ def _confirming_ns(
         half_m = factor * float(np.hypot(stretch.sigma_m[sample], read.sigma_m))
         half_m += float(clock_m[sample]) + read.clock_m
         for place in read.places:
-            there_m, _ = route.coordinate(np.array([place.element]), np.array([place.measure_m]), at_m)
+            there_m, _ = route.coordinates_of(np.array([place.element]), np.array([place.measure_m]), at_m)
             if low_m - half_m <= float(there_m[0]) <= high_m + half_m and half_m <= most_m:
                 confirming.add(read.t_ns)
     return sorted(confirming)
@@ -231,53 +232,57 @@ def evidence_of(
     main = counters[0] if counters else None
     least_m = config.matching.orientation_distance_m
     stretches, off_track = reference
-    sides = [sided(stretch, main, least_m) for stretch in stretches]
-    oriented = frozenset(side.first_oriented for side in sides if abs(side.with_m - side.against_m) >= least_m)
+    sides = [orient_stretch(stretch, main, least_m) for stretch in stretches]
+    oriented = frozenset(side.first_oriented_element for side in sides if abs(side.with_m - side.against_m) >= least_m)
     if any(min(side.with_m, side.against_m) >= least_m for side in sides):
         counters = [counter.without_sign() for counter in counters]
     searches = [GapSearch(counter, network, config, oriented) for counter in counters]
-    lags = [_lags_of_reference(stretches, search, least_m) for search in searches]
+    lags = [_measure_reference_lags(stretches, search, least_m) for search in searches]
     # Any odometer contradicts a reference; where one is independent, the others are not asked.
-    found = [Witness.of(*of_one, config) for of_one in zip(counters, lags, strict=True)]
+    found = [Witness.with_measured_scale(*of_one, config) for of_one in zip(counters, lags, strict=True)]
     lags_of_others = [
-        [_lags_of_anchors(search.carried(_points(anchors)), config) for search in searches] for anchors in recorders
+        [_measure_anchor_lags(search.carry_over_gaps(_instant_pairs(anchors)), config) for search in searches]
+        for anchors in recorders
     ]
-    of_reference, *of_others = clocks_of((lags, *lags_of_others), bool(independent), hazards)
-    by_recorder = [on_clock(anchors, clock, main) for anchors, clock in zip(recorders, of_others, strict=True)]
+    of_reference, *of_others = recorder_clocks((lags, *lags_of_others), bool(independent), hazards)
+    by_recorder = [put_on_clock(anchors, clock, main) for anchors, clock in zip(recorders, of_others, strict=True)]
     clocked = sorted((anchor for anchors in by_recorder for anchor in anchors), key=lambda anchor: anchor.t_ns)
     recorded, unclosed = _known_stretches(sides, of_reference, found, clocked, searches, vehicle, config)
-    known = tuple(part for stretch in recorded for part in stretch.trusted())
+    known = tuple(part for stretch in recorded for part in stretch.without_doubtful())
     unsure = [span for stretch in recorded for span in stretch.doubtful_spans()]
-    apart = outside(clocked, known)
+    apart = anchors_outside(clocked, known)
     shift_ns = round(of_reference.shift_s * NS_PER_S)
     return TrainEvidence(
         stretches=known,
         off_track=tuple((begin_ns - shift_ns, end_ns - shift_ns) for begin_ns, end_ns in off_track),
-        carried=tuple(search.carried(_borders(known, search.counter, apart)) for search in searches),
-        by_reads=tuple(search.carried(_points(clocked)) for search in searches) if recorded else (),
+        carried=tuple(search.carry_over_gaps(_anchor_pairs(known, search.counter, apart)) for search in searches),
+        by_reads=tuple(search.carry_over_gaps(_instant_pairs(clocked)) for search in searches) if recorded else (),
         reads_ns=np.array([anchor.t_ns for anchor in clocked], dtype=np.int64),
-        clocks=(of_reference,) * bool(known) + _used(of_others, [outside(anchors, known) for anchors in by_recorder]),
+        clocks=(of_reference,) * bool(known)
+        + _clocks_in_use(of_others, [anchors_outside(anchors, known) for anchors in by_recorder]),
         network=network,
         config=config,
         stands=final_stands([stretch.reference for stretch in known], independent, config),
-        parted=_parted(odometers, config),
+        parted=_odometers_disagree(odometers, config),
         unsure=tuple(unsure),
-        true_clocks_s=true_clocks_s((of_reference,) * bool(known) + _used(of_others, by_recorder)),
+        true_clocks_s=possible_leads_s((of_reference,) * bool(known) + _clocks_in_use(of_others, by_recorder)),
         disputes=tuple(span for stretch in recorded for span in stretch.disputed),
         doubted=unclosed
-        + sum(stretch.levels.doubts for stretch in recorded)
+        + sum(stretch.levels.count_doubted_steps for stretch in recorded)
         + (0 if counters else sum(len(stretch.disputed) for stretch in recorded))
         + sum(len(of_one.found) > 1 for of_one in lags),
     )
 
 
-def _used(clocks: Sequence[RecorderClock], anchors: Sequence[Sequence[TrueAnchor]]) -> tuple[RecorderClock, ...]:
+def _clocks_in_use(
+    clocks: Sequence[RecorderClock], anchors: Sequence[Sequence[TrueAnchor]]
+) -> tuple[RecorderClock, ...]:
     """The clocks of the recorders that have anchors."""
     return tuple(clock for clock, of_one in zip(clocks, anchors, strict=True) if of_one)
 
 
 def _known_stretches(
-    sides: Sequence[Sided],
+    sides: Sequence[OrientedStretch],
     clock: RecorderClock,
     witnesses: Sequence[Witness],
     reads: Sequence[TrueAnchor],
@@ -287,48 +292,48 @@ def _known_stretches(
 ) -> tuple[list[KnownStretch], int]:
     """The stretches of the reference, and how many gaps its own ends and the odometer do not close: steps of it too."""
     ahead_m = vehicle.gnss_antenna_ahead_m
-    known = [known_stretch(side, clock, witnesses, reads, ahead_m, config) for side in sides]
+    known = [stretch_as_evidence(side, clock, witnesses, reads, ahead_m, config) for side in sides]
     order = sorted(range(len(known)), key=lambda number: int(known[number].t_ns[0]))
     steps_m = [0.0] * max(len(known) - 1, 0)
     for search, witness in zip(searches[:1], witnesses[:1], strict=True):
-        borders = [known[number].ends(search.counter) for number in order]
+        borders = [known[number].end_anchors(search.counter) for number in order]
         steps_m = [
             search.misclosure_m(before[1], after[0], witness.scale, witness.scale_sigma)
             for before, after in pairwise(borders)
         ]
     levels = [known[number].levels for number in order]
-    if len(known) < 2 or not (any(steps_m) or any(of.doubts for of in levels)):
+    if len(known) < 2 or not (any(steps_m) or any(of.count_doubted_steps for of in levels)):
         return known, 0
     for number, beyond in zip(order, levels_beyond(levels, steps_m), strict=True):
-        known[number] = known_stretch(sides[number], clock, witnesses, reads, ahead_m, config, beyond)
+        known[number] = stretch_as_evidence(sides[number], clock, witnesses, reads, ahead_m, config, beyond)
     return known, sum(map(bool, steps_m))
 
 
-def _borders(
+def _anchor_pairs(
     stretches: Sequence[KnownStretch], counter: SignedOdometer, reads: Sequence[TrueAnchor]
 ) -> list[tuple[TrueAnchor, TrueAnchor]]:
     """First and last anchor of each stretch and of each read: between them nothing has to be carried."""
-    return [*(stretch.ends(counter) for stretch in stretches), *_points(reads)]
+    return [*(stretch.end_anchors(counter) for stretch in stretches), *_instant_pairs(reads)]
 
 
-def _points(known: Sequence[TrueAnchor]) -> list[tuple[TrueAnchor, TrueAnchor]]:
+def _instant_pairs(known: Sequence[TrueAnchor]) -> list[tuple[TrueAnchor, TrueAnchor]]:
     """Anchors that last for an instant: first and last anchor are the same."""
     return [(anchor, anchor) for anchor in known]
 
 
-def _lags_of_reference(stretches: Sequence[ReferenceStretch], search: GapSearch, least_m: float) -> Lags:
-    """Its clock against that of one odometer, in the sense in which that one counts.
+def _measure_reference_lags(stretches: Sequence[ReferenceStretch], search: GapSearch, least_m: float) -> Lags:
+    """The lag of the reference behind one odometer, in the sense in which that one counts.
 
-    One that counts up in both directions is compared where the train cannot have turned.
+    An odometer that counts up in both directions is compared where the train cannot have turned.
     """
-    sides = [sided(stretch, search.counter, least_m) for stretch in stretches]
+    sides = [orient_stretch(stretch, search.counter, least_m) for stretch in stretches]
     begin_ns, end_ns, moved_m, sigma_m = reference_movements(sides, search.only_length_m)
     moved_m = moved_m if search.counter.signed else np.abs(moved_m)
-    return lags_of(begin_ns, end_ns, moved_m, sigma_m, search.counter, search.config)
+    return measure_lags(begin_ns, end_ns, moved_m, sigma_m, search.counter, search.config)
 
 
-def _lags_of_anchors(source: Carried, config: Configuration) -> Lags:
-    """The clock of a recorder against an odometer's, by the distances between its anchors, closed or not."""
+def _measure_anchor_lags(source: CarriedGaps, config: Configuration) -> Lags:
+    """The lag of a recorder behind an odometer, by the distances between its anchors, closed or not."""
     movements = [
         (gap.begin_ns, gap.end_ns, apart_m, float(np.linalg.norm([anchor.sigma_m for anchor in gap.anchors])))
         for gap in source.gaps
@@ -336,11 +341,11 @@ def _lags_of_anchors(source: Carried, config: Configuration) -> Lags:
     ]
     begins, ends, *lengths = zip(*movements, strict=True) if movements else ((), (), (), ())
     moved_m, sigma_m = (np.array(values, np.float64) for values in lengths)
-    return lags_of(np.array(begins, np.int64), np.array(ends, np.int64), moved_m, sigma_m, source.counter, config)
+    return measure_lags(np.array(begins, np.int64), np.array(ends, np.int64), moved_m, sigma_m, source.counter, config)
 
 
-def _parted(odometers: Sequence[Odometry], config: Configuration) -> bool:
-    """An odometer of unknown origin counts otherwise than an independent one, by more than 5 m + 5 % of a distance."""
+def _odometers_disagree(odometers: Sequence[Odometry], config: Configuration) -> bool:
+    """Whether an odometer of unknown origin and an independent one differ by more than 5 m + 5 % of a distance."""
     independent = [odometer for odometer in odometers if odometer.independent]
     others = [odometer for odometer in odometers if odometer.origin is Origin.UNKNOWN and not odometer.follows_gnss]
     for other in others:

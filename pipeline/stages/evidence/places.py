@@ -31,7 +31,7 @@ class TruePlaces:
         return TruePlaces(self.netelement_ids[rows], self.low_m[rows], self.high_m[rows])
 
     def columns(self) -> list[pl.Series]:
-        """As they stand in `epochs`."""
+        """As columns of `epochs`."""
         return [
             self.netelement_ids.alias("true_netelement_ids"),
             pl.Series("true_measure_low_m", self.low_m, nan_to_null=True),
@@ -49,7 +49,7 @@ def true_places(evidence: EvidenceSet, track: SurveyedTrack) -> TruePlaces:
     Returns:
         Net elements and measures [m] of n instants.
     """
-    parts = [_touched(alternative) for alternative in evidence.alternatives]
+    parts = [_touched_elements(alternative) for alternative in evidence.alternatives]
     row, element = (np.concatenate([np.zeros(0, np.int64), *(getattr(part, name) for part in parts)]) for name in _KEYS)
     ends_m = [np.concatenate([np.zeros(0), *(getattr(part, name) for part in parts)]) for name in ("low_m", "high_m")]
     order = np.lexsort((element, row))
@@ -62,11 +62,11 @@ def true_places(evidence: EvidenceSet, track: SurveyedTrack) -> TruePlaces:
     places_m = np.full((2, size), np.nan)
     if begins.size:
         places_m[:, row[begins]] = np.minimum.reduceat(low_m, begins), np.maximum.reduceat(high_m, begins)
-    ids = _names_of(element[once], counts, track.ids)
+    ids = _element_lists(element[once], counts, track.ids)
     return TruePlaces(ids, *np.where(counts == 1, places_m, np.nan))
 
 
-def _names_of(element: Ints, counts: Ints, ids: Sequence[str]) -> pl.Series:
+def _element_lists(element: Ints, counts: Ints, ids: Sequence[str]) -> pl.Series:
     """Lists of names of so many net elements each, one list after the other in `element`; null for none."""
     # Few sets of net elements stand at many instants: each list is made once.
     sets: dict[tuple[int, ...], int] = {}
@@ -95,7 +95,8 @@ class _Touched(NamedTuple):
     high_m: Floats
 
 
-def _touched(there: Alternative) -> _Touched:
+def _touched_elements(there: Alternative) -> _Touched:
+    """The net elements that each interval of an alternative touches, with the measures on them."""
     route = there.route
     first, last = (
         np.maximum(np.searchsorted(route.entry_m, at_m, side="right") - 1, 0) for at_m in (there.low_m, there.high_m)

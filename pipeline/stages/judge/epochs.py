@@ -8,7 +8,7 @@ import polars as pl
 from pipeline.stages.epochs.clock import crossing_gaps_ns, nominal_period_s, periods_before_s, reactions_ns
 from pipeline.stages.epochs.verdicts import MonitoredEpochs
 from pipeline.stages.evidence import TrainEvidence, true_places
-from pipeline.stages.evidence.evidence import Span, within_spans
+from pipeline.stages.evidence.evidence import Span, inside_spans
 from pipeline.stages.judge.judged import REFERENCE, RIGHT, WRONG, JudgedEpochs, JudgedOffers, Judgements
 from pipeline.stages.judge.judgement import (
     JudgeInput,
@@ -337,7 +337,7 @@ def judged_epochs(given: JudgeInput, steps: OdometerSteps) -> JudgedEpochs:
     judged = along.turned(direction)
     train_m = positions.path_m - along.known_error_m(config.hazards.known_error_m)
     reference_m = np.where(along.kind == REFERENCE, train_m, np.nan)
-    standing = within_spans(at_ns, given.evidence.standstills)
+    standing = inside_spans(at_ns, given.evidence.standstills)
     accepted_ns = given.solution.crossings.t_ns[given.solution.crossings.accepted]
     odometer_wrong = exceeds_odometer_confidence(
         epochs.t_ns, epochs.odometer_m, train_m, along.half_m, accepted_ns, config.lds
@@ -379,7 +379,7 @@ def direction_by_evidence(
     at_ns = valid_at_ns(epochs.t_ns, vehicle)
     index = evidence.network.track.index
     along = judge_positions(
-        MatchedPositions.of_epochs(epochs, index), evidence.at(at_ns), path.routes(index), config.hazards
+        MatchedPositions.of_epochs(epochs, index), evidence.at(at_ns), path.routes_by_leg(index), config.hazards
     )
     return travel_direction(epochs.direction, along, at_ns, epochs.path_m, has_odometer=False, config=config.hazards)
 

@@ -12,7 +12,7 @@ import polars as pl
 
 from pipeline.stages.epochs.clock import crossing_gaps_ns, passings
 from pipeline.stages.epochs.verdicts import failure_log
-from pipeline.stages.evidence.evidence import KINDS, NOTHING, Alternative, EvidenceSet, Span, within_spans
+from pipeline.stages.evidence.evidence import KINDS, NOTHING, Alternative, EvidenceSet, Span, inside_spans
 from pipeline.stages.judge.episodes import alarms_table, find_episodes
 from pipeline.stages.judge.epochs import judged_epochs, judged_offers, odometer_steps, speed_at_mps
 from pipeline.stages.judge.failures import Failure, error_history, find_failures
@@ -108,7 +108,7 @@ def true_crossings(t_ns: Ints, evidence: EvidenceSet, places: dict[str, Place], 
     alternatives = np.bincount(
         np.concatenate([track.rows for track in evidence.alternatives] or [np.zeros(0, np.int64)]), minlength=t_ns.size
     )
-    tracks = [track.where(alternatives[track.rows] == 1) for track in evidence.alternatives]
+    tracks = [track.some_rows(alternatives[track.rows] == 1) for track in evidence.alternatives]
     train = _Train(t_ns, *np.full((3, t_ns.size), np.nan))
     for track in tracks:
         train.element[track.rows], train.measure_m[track.rows], _ = track.route.locate(track.middle_m)
@@ -122,7 +122,7 @@ def true_crossings(t_ns: Ints, evidence: EvidenceSet, places: dict[str, Place], 
             continue
         rows, at_m = _rows_about_track(track, train)
         on_track = np.isin(rows, track.rows)
-        for balise, visit_m, sense in zip(*track.route.places(elements, measures_m), strict=True):
+        for balise, visit_m, sense in zip(*track.route.visits_of_places(elements, measures_m), strict=True):
             if at_m.min() <= visit_m <= at_m.max():
                 crossed = _crossings_of_place(train, rows, on_track, at_m - visit_m, config)
                 turned = [crossing._replace(sense=int(crossing.sense * sense)) for crossing in crossed]
@@ -137,7 +137,7 @@ def _rows_about_track(track: Alternative, train: _Train) -> tuple[Ints, Floats]:
     neighbours = np.setdiff1d(around, rows)
     element = np.nan_to_num(train.element[neighbours], nan=-1).astype(np.int64)
     near_m = track.middle_m[np.searchsorted(rows, neighbours).clip(0, rows.size - 1)]
-    there_m, _ = track.route.coordinate(element, train.measure_m[neighbours], near_m)
+    there_m, _ = track.route.coordinates_of(element, train.measure_m[neighbours], near_m)
     known = np.isfinite(there_m)
     both = np.concatenate([rows, neighbours[known]])
     order = np.argsort(both, kind="stable")
@@ -213,7 +213,7 @@ def passages_table(
         t_true.cast(pl.Datetime("ns", "UTC")),
         *of_offers,
         _passage_speeds_mps(passages, t_true, epochs, given.config.lds),
-        pl.Series("suspect_after_the_fact", accepted & within_spans(offered_ns, undetected)),
+        pl.Series("suspect_after_the_fact", accepted & inside_spans(offered_ns, undetected)),
     )
     return frame.with_columns(failure_columns(frame, inserted, positioned)).select(Passages.column_names())
 
@@ -414,7 +414,7 @@ def judge(given: JudgeInput) -> Judged:
         failures=failures,
         epochs=epochs,
         offers=offers,
-        suspect_after_the_fact=within_spans(epochs.t_ns, undetected) & epochs.tvb,
+        suspect_after_the_fact=inside_spans(epochs.t_ns, undetected) & epochs.tvb,
         distance_m=_driven_distance_m(given, epochs),
         evidence=_main_evidence(epochs.judgements.kind),
     )

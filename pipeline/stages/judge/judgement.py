@@ -11,9 +11,9 @@ import numpy as np
 import polars as pl
 
 from pipeline.stages.epochs.verdicts import MonitoredEpochs
-from pipeline.stages.evidence import TrainEvidence, either
-from pipeline.stages.evidence.carrying import Interval, carried_forward
-from pipeline.stages.evidence.evidence import NOTHING, Alternative, EvidenceSet, within_spans
+from pipeline.stages.evidence import TrainEvidence, unite
+from pipeline.stages.evidence.carrying import Interval, carry_from_accepted
+from pipeline.stages.evidence.evidence import NOTHING, Alternative, EvidenceSet, inside_spans
 from pipeline.stages.judge.judged import ODOMETER, RIGHT, UNKNOWN, WRONG, Judgements
 from pipeline.stages.odometry import Odometry
 from pipeline.stages.track.path import RoutePath, TravelledPath
@@ -62,7 +62,7 @@ class JudgeInput:
 
         By either clock where that may be off by leaps.
         """
-        return either([self.evidence.at(clock_ns) for clock_ns in self.on_possible_clocks_ns(at_ns)])
+        return unite([self.evidence.at(clock_ns) for clock_ns in self.on_possible_clocks_ns(at_ns)])
 
     def on_possible_clocks_ns(self, at_ns: Ints) -> list[Ints]:
         """The same instants on each clock of the evidence that they may be stamps of [ns]."""
@@ -78,7 +78,7 @@ class JudgeInput:
 
     def legs(self) -> list[RoutePath]:
         """Legs of the solution's path, by the numbers of net elements that the evidence counts with."""
-        return self.solution.path.routes(self.evidence.network.track.index)
+        return self.solution.path.routes_by_leg(self.evidence.network.track.index)
 
 
 def valid_at_ns(t_ns: Ints, vehicle: Vehicle) -> Ints:
@@ -136,7 +136,7 @@ def judge_with_odometer(
     standstills = given.evidence.standstills
     place_m = crossings.path_m[crossings.accepted]
     own = [
-        carried_forward(anchor_ns, place_m, clock_ns, given.odometry, standstills, given.config)
+        carry_from_accepted(anchor_ns, place_m, clock_ns, given.odometry, standstills, given.config)
         for anchor_ns, clock_ns in zip(
             given.on_possible_clocks_ns(accepted_ns), given.on_possible_clocks_ns(at_ns), strict=True
         )
@@ -144,7 +144,7 @@ def judge_with_odometer(
     # NaN, where one of the clocks leaves nothing known.
     low_m, high_m = np.min([low for low, _ in own], axis=0), np.max([high for _, high in own], axis=0)
     # Where it contradicts a reference, and nobody knows which of the two failed, it shows nothing.
-    unsure = within_spans(at_ns, given.evidence.unsure)
+    unsure = inside_spans(at_ns, given.evidence.unsure)
     train_m = np.where(unsure, np.nan, low_m), np.where(unsure, np.nan, high_m)
     return judge_by_own_anchors(judged, positions, train_m, given.config.hazards)
 
@@ -178,7 +178,7 @@ def judge_positions(
     judged = np.zeros(size, dtype=np.bool_)
     sense = _path_senses(positions, legs)
     for alternative in evidence.alternatives:
-        there = alternative.where(positions.known[alternative.rows])
+        there = alternative.some_rows(positions.known[alternative.rows])
         rows = there.rows
         least_m, most_m, off_track = _compare_with_alternative(positions, sense, there, legs)
         # On another track a position is wrong only if the match was sure of its own track.
@@ -210,7 +210,7 @@ def _path_senses(positions: MatchedPositions, legs: Sequence[RoutePath]) -> Ints
     sense = np.ones(positions.element.size, dtype=np.int64)
     for number, leg in enumerate(legs):
         rows = np.flatnonzero((positions.leg == number) & positions.known)
-        _, along = leg.coordinate(positions.element[rows], positions.measure_m[rows], positions.path_m[rows])
+        _, along = leg.coordinates_of(positions.element[rows], positions.measure_m[rows], positions.path_m[rows])
         sense[rows] = np.where(along == 0, 1, along)
     return sense
 
@@ -224,14 +224,14 @@ def _compare_with_alternative(
 ) -> _Relative:
     """The error of positions against one alternative: on its track, else along their own path to the train."""
     rows = there.rows
-    at_m, along = there.route.coordinate(positions.element[rows], positions.measure_m[rows], there.middle_m)
+    at_m, along = there.route.coordinates_of(positions.element[rows], positions.measure_m[rows], there.middle_m)
     forward = sense[rows] * along > 0
     low_m = np.where(forward, at_m - there.high_m, there.low_m - at_m)
     high_m = np.where(forward, at_m - there.low_m, there.high_m - at_m)
     off_track = ~np.isfinite(at_m)
     if off_track.any():
         low_m[off_track], high_m[off_track], off_track[off_track] = _compare_along_own_path(
-            positions, there.where(off_track), legs
+            positions, there.some_rows(off_track), legs
         )
     return low_m, high_m, off_track
 
@@ -251,13 +251,13 @@ def _compare_along_own_path(positions: MatchedPositions, there: Alternative, leg
     along = np.zeros(rows.size, dtype=np.int64)
     for number, leg in enumerate(legs):
         part = np.flatnonzero(positions.leg[rows] == number)
-        train_m[part], along[part] = leg.coordinate(element[part], measure_m[part], path_m[part])
+        train_m[part], along[part] = leg.coordinates_of(element[part], measure_m[part], path_m[part])
     # The train's route counts against the path of the solution.
     against = along * sense < 0
     ahead_m = path_m - train_m
     # The place of the position, if it were on the train's route: as far from the train's.
     onward_m = middle_m + np.where(against, -ahead_m, ahead_m)
-    off_track = ~np.isfinite(train_m) | there.route.covers(np.nan_to_num(onward_m, nan=-np.inf))
+    off_track = ~np.isfinite(train_m) | there.route.covers_coordinates(np.nan_to_num(onward_m, nan=-np.inf))
     low_m = ahead_m - np.where(against, middle_m - there.low_m, there.high_m - middle_m)
     high_m = ahead_m + np.where(against, there.high_m - middle_m, middle_m - there.low_m)
     return np.where(off_track, np.nan, low_m), np.where(off_track, np.nan, high_m), off_track

@@ -160,7 +160,7 @@ class SwitchZones:
         while length_m < _LONGEST_M and len(onward := network.successors[line[-1]]) == 1 and onward[0].to not in line:
             line.append(onward[0].to)
             length_m += network.length_m(line[-1])
-        parts = [track.surface[track.vertices(at // 2)][:: -1 if at % 2 else 1] for at in line]
+        parts = [track.surface[track.vertex_range(at // 2)][:: -1 if at % 2 else 1] for at in line]
         places = np.concatenate([parts[0], *(part[1:] for part in parts[1:])])
         return np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(places, axis=0), axis=1))]), places
 
@@ -293,7 +293,7 @@ def doubtful_stretches(claimed: Claims, t_ns: Ints, element: Ints, read: Bools, 
     """
     least = np.fmin(np.nan_to_num(claimed.live), np.nan_to_num(claimed.hindsight))
     ids = network.track.ids
-    groups = network.unbranched
+    groups = network.line_of_element
     rows = []
     for begin, last in spans_of((least < ONE_TRACK_LEFT) & (element >= 0)):
         part = slice(begin, last + 1)

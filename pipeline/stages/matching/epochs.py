@@ -181,8 +181,8 @@ class PlacedEpochs:
     @classmethod
     def on_path(cls, fixes: Fixes, path: TravelledPath, assignment: Assignment) -> PlacedEpochs:
         """Project every epoch onto its leg."""
-        feet = path.feet(fixes.points, assignment.leg, fixes.valid, assignment.near_path_m)
-        return cls(feet, *path.places(assignment.leg, feet, fixes.height_m))
+        feet = path.nearest_feet(fixes.points, assignment.leg, fixes.valid, assignment.near_path_m)
+        return cls(feet, *path.path_positions(assignment.leg, feet, fixes.height_m))
 
 
 @frozen

@@ -8,8 +8,8 @@ from pipeline.stages.paths.candidates import Candidates, belong_beyond
 from pipeline.stages.paths.path_set import PathSet
 from pipeline.stages.paths.path_steps import Move, Moves, PathSteps, Place
 from pipeline.stages.track.network import Network
-from pipeline.stages.track.path import Chain, moved_on
-from pipeline.stages.track.segments import Leg, Visit, leg_of, segments_at, shifted
+from pipeline.stages.track.path import Chain, move_along
+from pipeline.stages.track.segments import Leg, Visit, leg_of, segments_at, shift_leg
 from schemas.arrays import Bools, Floats, Ints
 from schemas.config import MatchingConfig
 from schemas.frozen import frozen
@@ -184,7 +184,7 @@ def _are_unrelated(states: PathStates, moves: Moves) -> Bools:
     for step in np.flatnonzero(np.diff(states.first) > 1).tolist():
         group = tuple(oriented[first[step] : first[step + 1]])
         if group not in known:
-            known[group] = not any(moves.network.linked(here, there) for here in group for there in group)
+            known[group] = not any(moves.network.are_linked(here, there) for here in group for there in group)
         apart[step] = known[group]
     return apart
 
@@ -254,7 +254,9 @@ class LegsOfSteps:
 
     def with_legs_turned(self, network: Network, legs: range) -> LegsOfSteps:
         """The same with some legs run in the other direction."""
-        chains = tuple(chain.turned(network) if index in legs else chain for index, chain in enumerate(self.chains))
+        chains = tuple(
+            chain.in_other_direction(network) if index in legs else chain for index, chain in enumerate(self.chains)
+        )
         inside = (self.leg >= legs.start) & (self.leg < legs.stop)
         length = np.array(
             [
@@ -299,9 +301,9 @@ def legs_with_positions(moves: Moves, course: PathCourse, decoded: LegsOfSteps) 
         if legs and chain.shared is not None:
             before = decoded.chains[index - 1]
             there = legs[-1].entry_m(chain.shared - before.low)
-            leg = shifted(leg, there - leg.entry_m(chain.shared - chain.low))
+            leg = shift_leg(leg, there - leg.entry_m(chain.shared - chain.low))
         elif legs:
-            leg = shifted(leg, _shift_over_break_m(moves, course, decoded, legs[-1], leg, index))
+            leg = shift_leg(leg, _shift_over_break_m(moves, course, decoded, legs[-1], leg, index))
         legs.append(leg)
     return legs
 
@@ -333,11 +335,11 @@ def with_direction_kept(moves: Moves, course: PathCourse, decoded: LegsOfSteps) 
 def _extend_legs(chains: list[Chain], network: Network, at: int, move: Move | None, to: int) -> int:
     """Extend the legs by one move to the element `to`, whose number is returned; without a move begin a new leg."""
     if move is None:
-        number = chains[-1].high + 1
+        number = chains[-1].last_number + 1
         chains.append(Chain((to,), (0.0,), number))
         return number
     for oriented in (*move.between, to) if move.sense else ():
-        at = moved_on(chains, network, at, oriented, move.sense)
+        at = move_along(chains, network, at, oriented, move.sense)
     return at
 
 

@@ -264,7 +264,7 @@ def read_elements(fixes: Fixes, site: Site, track: SurveyedTrack, balise_reads: 
     if balise_reads is None or site.balises is None:
         return read_element
     # Of an element that is passed twice, or about a cut, a read does not say which it was.
-    rows, elements = track.holding(site.balises)
+    rows, elements = track.elements_holding(site.balises)
     alone = np.flatnonzero(np.bincount(rows)[rows] == 1)
     places = site.balises[rows[alone]].select("balise_id", element=elements[alone])
     read = balise_reads.select("t", "balise_id").join(places, on="balise_id", maintain_order="left")
@@ -313,7 +313,7 @@ def _visits_by_passage(track: SurveyedTrack, leg: Leg) -> list[list[int]]:
     passages: list[list[int]] = []
     ended: object = None
     for number, visit in enumerate(leg.visits):
-        measure = track.measure_m[track.vertices(visit.element)]
+        measure = track.measure_m[track.vertex_range(visit.element)]
         begin, end = (measure[0], measure[-1]) if visit.forward else (measure[-1], measure[0])
         if passages and ended == (track.ids[visit.element], visit.forward, begin):
             passages[-1].append(number)
@@ -353,7 +353,7 @@ def _rival_words(match: Match, rows: Ints, least: float) -> str:
         return ""
     highest = _highest_confidences(match.possible, int(rows[0]), int(rows[-1]))
     ids = match.path.track.ids
-    on_path = set(match.path.elements())
+    on_path = set(match.path.element_names())
     order = sorted((-probability, ids[element]) for element, probability in highest.items())
     return "; ".join(f"{name} {-value:.3f}" for value, name in order if -value > least and name not in on_path)
 

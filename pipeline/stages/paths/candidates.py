@@ -10,7 +10,7 @@ import numpy as np
 
 from pipeline.stages.track.geodesy import Points, points_of
 from pipeline.stages.track.network import Network, Once
-from pipeline.stages.track.segments import Box, Feet, Polyline, box_about, downhill
+from pipeline.stages.track.segments import Box, Feet, Polyline, box_about, walk_to_nearest
 from pipeline.stages.track.survey import SurveyedTrack
 from schemas.arrays import Bools, Floats, Ints
 from schemas.frozen import frozen
@@ -42,7 +42,7 @@ class Segments(Polyline):
         """The search over all segments, or those in a box: a run needs only the part of a network about it."""
         from scipy.spatial import cKDTree  # takes long to load, and a log needs none
 
-        rows = np.arange(len(self)) if box is None else box.touched_by(self.start, self.end)
+        rows = np.arange(len(self)) if box is None else box.segments_touching(self.start, self.end)
         probes, segment = self._search_points(rows)
         return SegmentSearch(self, cKDTree(probes, balanced_tree=False, compact_nodes=False), segment)
 
@@ -173,7 +173,7 @@ def candidates_of(points: Points, network: Network, search: SegmentSearch, reach
     # Sorted by step, element and distance: the first row of each pair is the nearest probe.
     fresh = np.ones(len(step), dtype=bool)
     fresh[1:] = (step[1:] != step[:-1]) | (element[1:] != element[:-1])
-    feet = downhill(points.take(step[fresh]), segments, segment[fresh], segments.element)
+    feet = walk_to_nearest(points.take(step[fresh]), segments, segment[fresh], segments.element)
     near = np.flatnonzero(feet.distance_m <= reach_m)
     return _candidates_at_feet(len(points), network, segments, step[fresh][near], feet.take(near))
 
@@ -248,7 +248,7 @@ def _candidates_at_feet(points: int, network: Network, segments: Segments, step:
     corner = (past == 0) & (held != feet.fraction)
     side = np.where(feet.offset_m < 0, -1.0, 1.0)
     along = measure + held * span - track.measure_m[track.first[element]]
-    linked = network.linked_ends()
+    linked = network.have_successors()
     return Candidates(
         first=np.searchsorted(step, np.arange(points + 1)),
         step=step,

@@ -43,7 +43,7 @@ def path_set(
     search = search or search_about(steps.points.surface, network, config.reach_m)
     candidates = candidates_of(steps.points, network, search, config.reach_m)
     survey_m = network.survey_sigmas_m(config.survey_sigma_default_m, candidates.vertex)
-    groups = network.unbranched
+    groups = network.line_of_element
     # Until another track has come near there is nothing to tell apart.
     lines = groups[candidates.element]
     others = candidates.step[lines != lines[:1]]
@@ -311,7 +311,9 @@ class _Growth:
 
     def _is_within_reach(self, one: int, other: int, limit_m: float) -> bool:
         """Whether two elements are the same, or no more than `limit_m` apart along the network."""
-        reached = (self.network.reach(2 * one + side, limit_m).get(2 * other + to) for side in (0, 1) for to in (0, 1))
+        reached = (
+            self.network.within_reach(2 * one + side, limit_m).get(2 * other + to) for side in (0, 1) for to in (0, 1)
+        )
         return one == other or any(reach is not None and reach.distance_m <= limit_m for reach in reached)
 
     def _are_on_element(self, rows: Ints) -> Bools:
@@ -335,7 +337,7 @@ class _Growth:
         limit_m = (1.0 + self.config.detour_share) * float(self.steps.distance_m[step]) + self.config.detour_m
         reached: dict[int, int] = {}
         for leaving in (node.oriented, node.oriented ^ 1):
-            for to, reach in self.network.reach(leaving, limit_m).items():
+            for to, reach in self.network.within_reach(leaving, limit_m).items():
                 allowed = min(reach.barred_forward, reach.barred_backward) == 0
                 if allowed and reach.distance_m <= limit_m:
                     reached.setdefault(to // 2, to if leaving == node.oriented else to ^ 1)

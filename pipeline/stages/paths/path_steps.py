@@ -12,7 +12,7 @@ from numpy.lib.stride_tricks import sliding_window_view
 
 from pipeline.stages.track.geodesy import Points
 from pipeline.stages.track.network import Edge, Network
-from pipeline.stages.track.path import Chain, search
+from pipeline.stages.track.path import Chain, search_chains
 from schemas.arrays import NS_PER_S, Bools, Floats, Ints, median
 from schemas.config import MatchingConfig
 from schemas.frozen import frozen
@@ -259,19 +259,19 @@ class Moves:
             yield self._mismatch_cost(there.at_m - here.at_m, here.oriented, distance), 0, ()
         for sense, first, last in ((1, here, there), (-1, there, here)):
             # From the exit of the first to the entry of the last, both run in the sense of their elements.
-            found = self.network.reach(first.oriented, distance.limit_m).get(last.oriented)
+            found = self.network.within_reach(first.oriented, distance.limit_m).get(last.oriented)
             if found is None:
                 continue
             ends_m = self.network.length_m(first.oriented) - first.at_m + last.at_m
             driven_m = sense * (ends_m + found.distance_m)
             cost = self._mismatch_cost(driven_m, here.oriented, distance)
             barred = found.barred_forward if sense > 0 else found.barred_backward
-            yield cost + (self.break_cost if barred else 0.0), sense, found.chain.between
+            yield cost + (self.break_cost if barred else 0.0), sense, found.chain.inner_elements
             if cost > 1.0 and distance.measured and abs(driven_m) < abs(distance.distance_m):
                 # Another route may be as long as the odometer says.
                 for chain in self._longer_routes(first.oriented, last.oriented, sense, distance.limit_m - ends_m):
                     driven_m = sense * (ends_m + chain.entry_m[-1])
-                    yield self._mismatch_cost(driven_m, here.oriented, distance), sense, chain.between
+                    yield self._mismatch_cost(driven_m, here.oriented, distance), sense, chain.inner_elements
 
     def _longer_routes(self, first: int, last: int, sense: int, limit_m: float) -> Iterator[Chain]:
         """Routes, but for the shortest, from the exit of one element to the entry of another.
@@ -279,9 +279,9 @@ class Moves:
         Of equally long ones the first.
         """
         apart_m = self.config.detour_m / _MARGIN_SIGMAS
-        found = search(
+        found = search_chains(
             self.network,
-            Chain.behind(self.network, first),
+            Chain.ending_at_zero(self.network, first),
             limit_m,
             lambda chain: self._navigable_edges(chain, sense),
             lambda chain: (len(chain.oriented) > 1, chain.oriented[-1], round(chain.entry_m[-1] / apart_m)),

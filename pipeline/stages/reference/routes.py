@@ -44,28 +44,28 @@ class ElementStay:
     back: bool
 
 
-def routes_over(nodes: Sequence[VisitNode], last: int, most: int) -> list[list[ElementStay]]:
+def find_routes(nodes: Sequence[VisitNode], last: int, most: int) -> list[list[ElementStay]]:
     """Routes from the first step to the last that together run over every link between visits.
 
-    Nothing where there are more than `most`.
+    [] if more than `most`.
     """
     ends = {node for node in nodes if node.last == last and node.sampled}
-    leading_on = _closure(ends, forward=False)
+    leading_on = _reachable_visits(ends, forward=False)
     begins = {node for node in leading_on if node.first == 0 and node.sampled}
-    alive = leading_on & _closure(begins, forward=True)
-    routes = [_stays(node, [], last) for node in nodes if node in begins & ends & alive]
+    alive = leading_on & _reachable_visits(begins, forward=True)
+    routes = [_stays_on_route(node, [], last) for node in nodes if node in begins & ends & alive]
     covered: set[Link] = set()
     for link in [link for node in nodes if node in alive for link in node.after if link.there in alive]:
         links = None if link in covered else _route_over(link, begins, ends, alive, covered)
         if links is not None:
-            routes.append(_stays(links[0].here, links, last))
+            routes.append(_stays_on_route(links[0].here, links, last))
             covered |= set(links)
         if len(routes) > most:
             return []
     return routes
 
 
-def _closure(start: set[VisitNode], forward: bool) -> set[VisitNode]:
+def _reachable_visits(start: set[VisitNode], forward: bool) -> set[VisitNode]:
     """All visits reachable from `start`, forward or backward in time."""
     reached: set[VisitNode] = set()
     to_visit = list(start)
@@ -104,7 +104,7 @@ def _route_over(
     return links
 
 
-def _stays(start: VisitNode, links: Sequence[Link], last: int) -> list[ElementStay]:
+def _stays_on_route(start: VisitNode, links: Sequence[Link], last: int) -> list[ElementStay]:
     """The elements that a route from a visit over these links runs over, in order of time; `last`: the last step."""
     stays: list[ElementStay] = []
     node = start
@@ -119,18 +119,18 @@ def _stays(start: VisitNode, links: Sequence[Link], last: int) -> list[ElementSt
     return [*stays, ElementStay(node.oriented, entered, last, back)]
 
 
-def routes_of(found: PathSet, config: MatchingConfig, most: int) -> tuple[int, list[list[ElementStay]]]:
-    """Routes to the last step that together run over every hypothesis that nothing refutes, and the step they begin at.
+def unrefuted_routes(found: PathSet, config: MatchingConfig, most: int) -> tuple[int, list[list[ElementStay]]]:
+    """The first step, and the routes from it to the last that together run over every hypothesis nothing refutes.
 
-    Steps of stays count from there: the first one, or where a movement led back after every path was refuted. No routes
-    where there are more than `most`, and where every path is refuted: a set that began anew without such a movement
-    knows nothing of what went wrong before.
+    Steps of stays count from the first: that of the samples, or where a movement led back after every path was refuted.
+    No routes where there are more than `most`, and where every path is refuted: a set that began anew without such a
+    movement knows nothing of what went wrong before.
     """
     count = len(found.steps)
     first = max((node.stretch for node in found.nodes), default=0)
     if found.overflow < count or first not in (0, *found.returned):
         return first, []
-    nodes = {id(node): node for node in _living(found, first)}
+    nodes = {id(node): node for node in _unrefuted_hypotheses(found, first)}
     visits = {
         key: VisitNode(node.oriented, node.begin - first, node.end - 1 - first)
         for key, node in nodes.items()
@@ -140,12 +140,12 @@ def routes_of(found: PathSet, config: MatchingConfig, most: int) -> tuple[int, l
     every = list(visits.values())
     for key, visit in visits.items():
         node = nodes[key]
-        for origin, end in _origins(node):
+        for origin, end in _sampled_origins(node):
             every += _link_visits(moves, visits[id(origin)], visit, origin, node, end, first)
-    return first, [_without_cuts(route) for route in routes_over(every, count - 1 - first, most)]
+    return first, [_joined_stays(route) for route in find_routes(every, count - 1 - first, most)]
 
 
-def _living(found: PathSet, stretch: int) -> Iterator[Node]:
+def _unrefuted_hypotheses(found: PathSet, stretch: int) -> Iterator[Node]:
     """The hypotheses of a stretch that lived to the last step, and all that they went through."""
     count = len(found.steps)
     waiting = [node for node in found.nodes if node.stretch == stretch and node.end >= count and node.rejected >= count]
@@ -159,12 +159,12 @@ def _living(found: PathSet, stretch: int) -> Iterator[Node]:
 
 
 def _covers_a_step(node: Node) -> bool:
-    """It covers a step: others only led from one element to the next."""
+    """Whether a hypothesis covers a step: others only led from one element to the next."""
     return node.end > node.begin
 
 
-def _origins(node: Node) -> Iterator[tuple[Node, int]]:
-    """What a hypothesis came from, and the step before which it did."""
+def _sampled_origins(node: Node) -> Iterator[tuple[Node, int]]:
+    """The hypotheses with steps that a hypothesis came from, and the step before which it did."""
     waiting = [(origin, node.begin if origin is node.parent else origin.end) for origin in node.origins]
     while waiting:
         origin, step = waiting.pop()
@@ -181,8 +181,8 @@ def _link_visits(
 
     Visits count steps from `first` on.
     """
-    begin = _place(origin, step - 1)
-    end = _place(node, step)
+    begin = _place_at_step(origin, step - 1)
+    end = _place_at_step(node, step)
     move = moves.best_move(begin, end)
     if move is None or moves.least_cost(begin, end, moves.distance(begin.step, end.step)) >= moves.break_cost:
         return []
@@ -196,13 +196,13 @@ def _link_visits(
     return between
 
 
-def _place(node: Node, step: int) -> Place:
+def _place_at_step(node: Node, step: int) -> Place:
     """Place of a path at one of its steps."""
     row = min(max(step - node.begin, 0), node.end - node.begin - 1)
     return Place(step, node.oriented, float(node.left_m[row, node.oriented % 2]))
 
 
-def _without_cuts(stays: list[ElementStay]) -> list[ElementStay]:
+def _joined_stays(stays: list[ElementStay]) -> list[ElementStay]:
     """Stays on one element after each other are one: a pause of the samples was between them."""
     kept = [stays[0]]
     for stay in stays[1:]:

@@ -11,10 +11,10 @@ import polars as pl
 from pipeline.stages.paths.candidates import Candidates, SegmentSearch, candidates_of, search_about, segments_of
 from pipeline.stages.paths.growth import path_set
 from pipeline.stages.paths.path_steps import path_steps
-from pipeline.stages.reference.routes import ElementStay, routes_of
-from pipeline.stages.track.geodesy import Points, points_of, steps_m
+from pipeline.stages.reference.routes import ElementStay, unrefuted_routes
+from pipeline.stages.track.geodesy import Points, place_distances_m, points_of
 from pipeline.stages.track.network import Network
-from pipeline.stages.track.path import Chain, RoutePath, moved_on
+from pipeline.stages.track.path import Chain, RoutePath, move_along
 from pipeline.stages.track.segments import box_about
 from pipeline.stages.track.survey import end_places
 from schemas.arrays import NS_PER_S, Bools, Floats, Ints, floats, times_ns
@@ -35,7 +35,7 @@ class ReferencePath:
     aside_m: Floats
     root_m: Floats
 
-    def part(self, rows: slice) -> ReferencePath:
+    def some_rows(self, rows: slice) -> ReferencePath:
         """The same path, of some samples only."""
         arrays = {name: getattr(self, name)[rows] for name in ("leg", "at_m", "aside_m", "root_m")}
         return replace(self, **arrays)
@@ -73,15 +73,15 @@ def reference_stretches(
     if reference is None or reference.is_empty():
         return [], []
     hazards = config.hazards
-    samples = samples_of(reference, network, config)
+    samples = reference_samples(reference, network, config)
     # A sample beyond k_T roots of every track is no sample of the track.
-    placed = samples.placed(config.align.sure_sigmas)
-    near = placed & ~leaving(samples, placed, config) & ~off_the_survey(samples, network, hazards)
-    search = _Search(samples, network.unsearched(), numbers, config)
+    placed = samples.near_track(config.align.sure_sigmas)
+    near = placed & ~may_have_left(samples, placed, config) & ~may_be_off_survey(samples, network, hazards)
+    search = _RouteSearch(samples, network.unsearched(), numbers, config)
     stretches: list[ReferenceStretch] = []
     covered = np.zeros(samples.t_ns.size, dtype=np.bool_)
-    for rows in _between_gaps(samples.t_ns, np.flatnonzero(near), hazards.reference_gap_s):
-        rows, paths = search.paths(rows)
+    for rows in _split_at_gaps(samples.t_ns, np.flatnonzero(near), hazards.reference_gap_s):
+        rows, paths = search.find_paths(rows)
         if paths:
             part = slice(int(rows[0]), int(rows[-1]) + 1)
             stretches.append(ReferenceStretch(samples.t_ns[part], samples.sigma_m[part], paths))
@@ -89,7 +89,7 @@ def reference_stretches(
     return stretches, _spans_off_track(samples.t_ns, covered, hazards.reference_gap_s)
 
 
-def _between_gaps(t_ns: Ints, rows: Ints, gap_s: float) -> list[Ints]:
+def _split_at_gaps(t_ns: Ints, rows: Ints, gap_s: float) -> list[Ints]:
     """Samples without a pause or a lost sample among them."""
     if rows.size == 0:
         return []
@@ -114,19 +114,19 @@ def _spans_off_track(t_ns: Ints, covered: Bools, gap_s: float) -> list[tuple[int
 
 
 @frozen
-class _Search:
+class _RouteSearch:
     """The samples of a run, and where they may lie on the network."""
 
-    samples: Samples
+    samples: ReferenceSamples
     network: Network
     numbers: dict[str, int]
     config: Configuration
 
-    def paths(self, rows: Ints) -> tuple[Ints, tuple[ReferencePath, ...]]:
-        """All routes through samples without a gap, and those they run through.
+    def find_paths(self, rows: Ints) -> tuple[Ints, tuple[ReferencePath, ...]]:
+        """Samples of `rows`, a stretch without a gap, that routes run through, and all these routes.
 
-        None where they are more than `routes_limit`, or all are refuted; where a movement led back from aside, those
-        through the samples after it.
+        No routes where they are more than `routes_limit`, or all are refuted; where a movement led back from aside,
+        those through the samples after it.
         """
         hazards = self.config.hazards
         law = self.config.matching.model_copy(
@@ -141,11 +141,11 @@ class _Search:
         found = path_set(steps, self.network, law, samples.search)
         begins = rows[0] + np.searchsorted(samples.t_ns[rows], steps.begin_ns)
         ends = np.append(begins[1:], rows[-1] + 1)
-        first, routes = routes_of(found, law, hazards.routes_limit)
+        first, routes = unrefuted_routes(found, law, hazards.routes_limit)
         begins, ends = begins[first:], ends[first:]
-        return rows[int(begins[0] - rows[0]) :], tuple(self._path(stays, begins, ends) for stays in routes)
+        return rows[int(begins[0] - rows[0]) :], tuple(self._path_on_route(stays, begins, ends) for stays in routes)
 
-    def _path(self, stays: Sequence[ElementStay], begins: Ints, ends: Ints) -> ReferencePath:
+    def _path_on_route(self, stays: Sequence[ElementStay], begins: Ints, ends: Ints) -> ReferencePath:
         """A route with coordinates: each sample on the nearest of the elements that it visits about then.
 
         `begins`, `ends`: of each step the first sample, and that after its last.
@@ -158,7 +158,7 @@ class _Search:
         at_m = np.full(count, np.nan)
         leg = np.full(count, -1)
         survey_m = np.zeros(count)
-        legs, placed = _legs(stays, self.network)
+        legs, placed = _chains_of_route(stays, self.network)
         for stay, (number, entry_m) in zip(stays, placed, strict=True):
             low = int(begins[max(stay.first - 1, 0)])
             high = int(ends[min(stay.last + 1, ends.size - 1)])
@@ -173,18 +173,18 @@ class _Search:
         on_route = np.flatnonzero(leg >= 0)
         every = np.arange(count)
         leg = leg[on_route[np.maximum(np.searchsorted(on_route, every, side="right") - 1, 0)]]
-        routes = tuple(chain.route(self.network, self.numbers) for chain in legs)
+        routes = tuple(chain.as_route(self.network, self.numbers) for chain in legs)
         root_m = np.hypot(samples.sigma_m[begin : begin + count], survey_m)
         return ReferencePath(leg, np.interp(every, on_route, at_m[on_route]), routes, nearest_m, root_m)
 
 
-def _legs(stays: Sequence[ElementStay], network: Network) -> tuple[list[Chain], list[tuple[int, float]]]:
+def _chains_of_route(stays: Sequence[ElementStay], network: Network) -> tuple[list[Chain], list[tuple[int, float]]]:
     """The route as chains of one coordinate, and of each visit its chain and where it is entered [m]."""
     chains = [Chain((stays[0].oriented,), (0.0,))]
     placed = [(0, 0.0)]
     at = 0
     for stay in stays[1:]:
-        at = moved_on(chains, network, at, stay.oriented, -1 if stay.back else 1)
+        at = move_along(chains, network, at, stay.oriented, -1 if stay.back else 1)
         placed.append((len(chains) - 1, chains[-1].entry_m[at - chains[-1].low]))
     return chains, placed
 
@@ -193,7 +193,7 @@ def _legs(stays: Sequence[ElementStay], network: Network) -> tuple[list[Chain], 
 _SAMPLES = 50
 
 
-def off_the_survey(samples: Samples, network: Network, config: HazardConfig) -> Bools:
+def may_be_off_survey(samples: ReferenceSamples, network: Network, config: HazardConfig) -> Bools:
     """Samples behind an open end over which the train may have gone, where another track is near.
 
     Up to `open_end_m` from that end, or until the samples lie next to the element again.
@@ -220,7 +220,7 @@ def off_the_survey(samples: Samples, network: Network, config: HazardConfig) -> 
 
 def _open_ends(network: Network, elements: Ints) -> Iterator[tuple[int, int]]:
     """Elements and which of their ends no relation leads on from."""
-    linked = network.linked_ends()[elements]
+    linked = network.have_successors()[elements]
     for row, end in np.argwhere(~linked).tolist():
         yield int(elements[row]), int(end)
 
@@ -235,19 +235,19 @@ def _departures(sample: Ints, behind: Bools, possible: Bools) -> Iterator[tuple[
             yield int(sample[number]), -1
 
 
-def leaving(samples: Samples, on_track: Bools, config: Configuration) -> Bools:
-    """Samples next to a track on which the train may not be any more, or not yet: they border on samples on no track.
+def may_have_left(samples: ReferenceSamples, on_track: Bools, config: Configuration) -> Bools:
+    """Samples on which the train may have left its track, or not reached it yet; they border on samples on no track.
 
-    It left over a switch that the survey lacks, so from the last sample within `paths_back_sigmas` roots of a track on,
-    and for no longer than `reference_leaves_m`: by then the longest switches have led aside. `on_track`: samples that
-    lie on some track, by all that a root may be off.
+    It left over a switch that the survey lacks, so from the last sample within `paths_back_sigmas` combined sigmas of a
+    track on, and for no longer than `reference_leaves_m`: by then the longest switches have led aside. `on_track`:
+    samples that lie on some track, by all that they may be off.
     """
     near = samples.near
     roots = np.full(samples.t_ns.size, np.inf)
     np.minimum.at(roots, near.step, near.distance_m / samples.root_m)
     aside = roots > config.matching.paths_back_sigmas
     gap = np.diff(samples.t_ns) > config.hazards.reference_gap_s * NS_PER_S
-    distance_m = np.concatenate([[0.0], np.cumsum(steps_m(samples.points.surface))])
+    distance_m = np.concatenate([[0.0], np.cumsum(place_distances_m(samples.points.surface))])
     unsure = np.zeros(on_track.size, dtype=np.bool_)
     for off, sense in [
         *((row + 1, -1) for row in np.flatnonzero(on_track[:-1] & ~on_track[1:] & ~gap).tolist()),
@@ -266,7 +266,7 @@ def leaving(samples: Samples, on_track: Bools, config: Configuration) -> Bools:
 
 
 @frozen
-class Samples:
+class ReferenceSamples:
     """`sigma_m` of each; `near`: places by sample, `survey_m` the survey's sigma at each of these, `root_m` of both.
 
     `search`: where all that may be near the run is looked for.
@@ -284,27 +284,27 @@ class Samples:
         """Sigma of sample and survey together at each place near it [m]."""
         return np.hypot(self.sigma_m[self.near.step], self.survey_m)
 
-    def placed(self, factor: float) -> Bools:
-        """Samples with an element within `factor` roots."""
+    def near_track(self, factor: float) -> Bools:
+        """Samples with an element within `factor` combined sigmas of sample and survey."""
         placed = np.zeros(self.t_ns.size, dtype=np.bool_)
         placed[self.near.step[self.near.distance_m <= factor * self.root_m]] = True
         return placed
 
 
-def samples_of(reference: pl.DataFrame, network: Network, config: Configuration) -> Samples:
-    """Samples of a reference stream; places twice as far off as any that can be a sample's."""
+def reference_samples(reference: pl.DataFrame, network: Network, config: Configuration) -> ReferenceSamples:
+    """Samples of a reference stream with the places near them; these up to twice as far off as a sample may be."""
     hazards = config.hazards
     sigma_m = reference["sigma_m"].fill_null(hazards.reference_sigma_m).to_numpy()
     points = points_of(floats(reference, "latitude_deg"), floats(reference, "longitude_deg"))
     factor = 2.0 * config.align.sure_sigmas
     # Long chords are far off their curves: only those count that the run may be near.
-    most_m = float(np.hypot(sigma_m, network.most_survey_sigma_m(hazards.survey_sigma_m)).max())
+    most_m = float(np.hypot(sigma_m, network.largest_survey_sigma_m(hazards.survey_sigma_m)).max())
     segments = segments_of(network.track)
     box = box_about(points.surface, factor * most_m)
-    vertex = segments.vertex[box.touched_by(segments.start, segments.end)]
+    vertex = segments.vertex[box.segments_touching(segments.start, segments.end)]
     survey_m = network.survey_sigmas_m(hazards.survey_sigma_m, vertex).max(initial=hazards.survey_sigma_m)
     reach_m = factor * float(np.hypot(sigma_m, survey_m).max())
     search = search_about(points.surface, network, max(reach_m, config.matching.reach_m))
     near = candidates_of(points, network, search, reach_m)
     near_survey_m = network.survey_sigmas_m(hazards.survey_sigma_m, near.vertex)
-    return Samples(times_ns(reference), points, sigma_m, near, near_survey_m, search)
+    return ReferenceSamples(times_ns(reference), points, sigma_m, near, near_survey_m, search)

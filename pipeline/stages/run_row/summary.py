@@ -97,8 +97,8 @@ def replay_notes(monitored: MonitoredSolution, evidence: TrainEvidence) -> list[
             Note.OFF_NETWORK: _listed([_off_network_words(row) for row in monitored.match.off.iter_rows(named=True)]),
             Note.UNLINKED: _count_unlinked(monitored.lds.linking["link_distance"]),
             Note.UNKNOWN_TELEGRAMS: ", ".join(sorted(set(monitored.lds.unknown_reads["balise_id"]))),
-            Note.READS_DISPUTED: evidence.disputed,
-            Note.READS_UNREACHABLE: evidence.unreachable,
+            Note.READS_DISPUTED: evidence.count_disputed_reads,
+            Note.READS_UNREACHABLE: evidence.count_unreachable,
         }
     )
 

@@ -12,7 +12,7 @@ from functools import cached_property
 
 import numpy as np
 
-from pipeline.stages.track.geodesy import sines, steps_m
+from pipeline.stages.track.geodesy import place_distances_m, sines_and_cosines
 from pipeline.stages.track.survey import SurveyedTrack
 from schemas.arrays import Floats, Ints
 
@@ -39,63 +39,65 @@ class Chords:
 
     def sigmas_m(self, vertex: Ints) -> Floats:
         """Sigma of the distance between chord and curve [m] for the segments that begin at some vertices."""
-        unknown = vertex[np.isnan(self._known_m[vertex])]
+        unknown = vertex[np.isnan(self._sigma_by_vertex_m[vertex])]
         for element in np.unique(np.searchsorted(self.track.first, unknown, side="right") - 1).tolist():
-            if np.isnan(self._known_m[self.track.first[element]]):
-                self._measure_chain(_chain_through(element, self._after))
-        return self._known_m[vertex]
+            if np.isnan(self._sigma_by_vertex_m[self.track.first[element]]):
+                self._measure_chain(_chain_through(element, self._straight_neighbours))
+        return self._sigma_by_vertex_m[vertex]
 
     @cached_property
-    def most_m(self) -> float:
-        """No sigma of the track is larger: of a chord as long as they get, with half a turn."""
-        step_m = steps_m(self.track.surface)
+    def largest_sigma_m(self) -> float:
+        """A bound [m] of all sigmas of the track: of a chord as long as they get, with half a turn."""
+        step_m = place_distances_m(self.track.surface)
         step_m[self.track.first[1:-1] - 1] = 0.0
         return float(_LONGEST_M + step_m.max()) * np.pi / 16.0
 
     @cached_property
-    def _known_m(self) -> Floats:
-        """Projections worked out so far, by vertex; not a number where none is yet [m]."""
+    def _sigma_by_vertex_m(self) -> Floats:
+        """Sigmas worked out so far, by vertex [m]; NaN where none is yet."""
         return np.full(len(self.track.measure_m), np.nan)
 
     @cached_property
-    def _onward(self) -> tuple[Ints, Floats]:
+    def _straightest_successors(self) -> tuple[Ints, Floats]:
         """The successor that each oriented element goes on to with the least turn, and that turn; -1 without one."""
         first = self.track.first[:-1]
         last = self.track.first[1:] - 2
-        _, first_rad = _segments(self.track, first)
-        _, last_rad = _segments(self.track, last)
+        _, first_rad = _segment_lengths_and_headings(self.track, first)
+        _, last_rad = _segment_lengths_and_headings(self.track, last)
         enter_rad = np.column_stack([first_rad[:, 0], last_rad[:, 1] + np.pi]).ravel()
         leave_rad = np.column_stack([last_rad[:, 1], first_rad[:, 0] + np.pi]).ravel()
-        return _straightest(leave_rad, enter_rad, self.here, self.there)
+        return _least_turns(leave_rad, enter_rad, self.here, self.there)
 
     @cached_property
-    def _after(self) -> Ints:
+    def _straight_neighbours(self) -> Ints:
         """The straightest successor of each oriented element, if it is its straightest predecessor too."""
-        onward, _ = self._onward
+        onward, _ = self._straightest_successors
         # `oriented ^ 1` is the same element run in the other direction.
         back = onward[onward ^ 1] == np.arange(len(onward)) ^ 1
         return np.where((onward >= 0) & back, onward, -1)
 
     def _measure_chain(self, chain: list[int]) -> None:
         """Work out the segments of a chain of elements."""
-        vertex, against = _vertices(self.track, chain)
-        length_m, heading_rad = _segments(self.track, vertex)
+        vertex, against = _segment_vertices(self.track, chain)
+        length_m, heading_rad = _segment_lengths_and_headings(self.track, vertex)
         row = np.arange(len(vertex))
         begin_rad = heading_rad[row, against] + np.pi * against
         end_rad = heading_rad[row, 1 - against] + np.pi * against
-        inner_rad = _wrapped(begin_rad[1:] - end_rad[:-1])
+        inner_rad = _wrap_angle(begin_rad[1:] - end_rad[:-1])
         # A chain ends at a switch whose other branch is straighter: the turn there is the switch's, not the track's.
         turn_rad = np.concatenate([[0.0], inner_rad, [0.0]])
-        self._known_m[vertex] = _sigmas_m(np.append(0.0, np.cumsum(length_m)), turn_rad)
+        self._sigma_by_vertex_m[vertex] = _chord_sigmas_m(np.append(0.0, np.cumsum(length_m)), turn_rad)
 
 
-def _segments(track: SurveyedTrack, vertex: Ints) -> tuple[Floats, Floats]:
+def _segment_lengths_and_headings(track: SurveyedTrack, vertex: Ints) -> tuple[Floats, Floats]:
     """Length [m] of the segment that begins at each vertex, and its heading [rad] at its start and at its end."""
     along = track.surface[vertex + 1] - track.surface[vertex]
     x_m, y_m, z_m = along.T
     headings = []
     for viewpoint in (vertex, vertex + 1):
-        sin_lat, cos_lat, sin_lon, cos_lon = sines(track.latitude_deg[viewpoint], track.longitude_deg[viewpoint])
+        sin_lat, cos_lat, sin_lon, cos_lon = sines_and_cosines(
+            track.latitude_deg[viewpoint], track.longitude_deg[viewpoint]
+        )
         # The segment on the unit vectors east and north there (`geodesy.points_of`).
         east_m = x_m * -sin_lon + y_m * cos_lon
         north_m = x_m * (-sin_lat * cos_lon) + y_m * (-sin_lat * sin_lon) + z_m * cos_lat
@@ -103,13 +105,13 @@ def _segments(track: SurveyedTrack, vertex: Ints) -> tuple[Floats, Floats]:
     return np.linalg.norm(along, axis=1), np.column_stack(headings)
 
 
-def _straightest(leave_rad: Floats, enter_rad: Floats, here: Ints, there: Ints) -> tuple[Ints, Floats]:
+def _least_turns(leave_rad: Floats, enter_rad: Floats, here: Ints, there: Ints) -> tuple[Ints, Floats]:
     """Successor of each oriented element with the least turn, -1 without one, and that turn [rad].
 
     `leave_rad`, `enter_rad`: heading at the exit and the entry of each; `here`, `there`: pairs of successors.
     """
     # Sorted by element, then by turn: the first row of each element is its straightest successor.
-    turns_rad = _wrapped(enter_rad[there] - leave_rad[here])
+    turns_rad = _wrap_angle(enter_rad[there] - leave_rad[here])
     order = np.lexsort((np.abs(turns_rad), here))
     least = order[np.diff(here[order], prepend=-1) > 0]
     onward = np.full(len(leave_rad), -1)
@@ -121,11 +123,11 @@ def _straightest(leave_rad: Floats, enter_rad: Floats, here: Ints, there: Ints) 
 
 def _chain_through(element: int, after: Ints) -> list[int]:
     """Oriented elements of which each goes straight on from the one before: the same whichever of them is asked for."""
-    return _chain(2 * min(oriented // 2 for oriented in _chain(2 * element, after)), after)
+    return _straight_chain(2 * min(oriented // 2 for oriented in _straight_chain(2 * element, after)), after)
 
 
-def _chain(start: int, after: Ints) -> list[int]:
-    """A ring ends with `start`."""
+def _straight_chain(start: int, after: Ints) -> list[int]:
+    """Oriented elements that go straight on through `start`, in order; a ring ends with `start`."""
     first = start
     while (before := int(after[first ^ 1])) not in (-1, start ^ 1):
         first = before ^ 1
@@ -135,7 +137,7 @@ def _chain(start: int, after: Ints) -> list[int]:
     return chain
 
 
-def _vertices(track: SurveyedTrack, chain: Sequence[int]) -> tuple[Ints, Ints]:
+def _segment_vertices(track: SurveyedTrack, chain: Sequence[int]) -> tuple[Ints, Ints]:
     """Vertices at which the segments of a chain begin, and whether they are run against their measure (0 or 1)."""
     parts = []
     for oriented in chain:
@@ -144,7 +146,7 @@ def _vertices(track: SurveyedTrack, chain: Sequence[int]) -> tuple[Ints, Ints]:
     return np.concatenate(parts), np.repeat(np.array(chain) % 2, [len(part) for part in parts])
 
 
-def _sigmas_m(distance_m: Floats, turn_rad: Floats) -> Floats:
+def _chord_sigmas_m(distance_m: Floats, turn_rad: Floats) -> Floats:
     """Largest sigma of all chords that each segment between points of a chain may be a part of [m].
 
     A chord spans 1, 2, ... `points` segments. Its turn is the geometric mean of the turns at its ends (0 with a
@@ -203,6 +205,6 @@ def _turn_at_begin(distance_m: Floats, bend_rad: Floats) -> float:
     return min(own_rad, max(2.0 * (own_rad - arc_rad), 0.0))
 
 
-def _wrapped(angle_rad: Floats) -> Floats:
+def _wrap_angle(angle_rad: Floats) -> Floats:
     """Angle between -π and π."""
     return np.asarray((angle_rad + np.pi) % (2.0 * np.pi) - np.pi)

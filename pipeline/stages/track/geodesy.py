@@ -36,10 +36,10 @@ class Points:
 
 def points_of(latitude_deg: Floats, longitude_deg: Floats) -> Points:
     """The places of positions, heights left out: horizontal work needs none, and many recordings have none."""
-    sin_lat, cos_lat, sin_lon, cos_lon = sines(latitude_deg, longitude_deg)
+    sin_lat, cos_lat, sin_lon, cos_lon = sines_and_cosines(latitude_deg, longitude_deg)
     zeros = np.zeros_like(sin_lat)
     return Points(
-        surface=_ecef(sin_lat, cos_lat, sin_lon, cos_lon, zeros),
+        surface=_ellipsoid_to_earth_centred_m(sin_lat, cos_lat, sin_lon, cos_lon, zeros),
         east=np.column_stack([-sin_lon, cos_lon, zeros]),
         north=np.column_stack([-sin_lat * cos_lon, -sin_lat * sin_lon, cos_lat]),
     )
@@ -47,15 +47,17 @@ def points_of(latitude_deg: Floats, longitude_deg: Floats) -> Points:
 
 def earth_centred_m(latitude_deg: Floats, longitude_deg: Floats, height_m: Floats) -> Floats:
     """Earth-centred, earth-fixed coordinates [m], shape (n, 3)."""
-    return _ecef(*sines(latitude_deg, longitude_deg), np.asarray(height_m, dtype=np.float64))
+    return _ellipsoid_to_earth_centred_m(
+        *sines_and_cosines(latitude_deg, longitude_deg), np.asarray(height_m, dtype=np.float64)
+    )
 
 
-def distances_m(latitude_deg: Floats, longitude_deg: Floats, height_m: Floats) -> Floats:
+def point_distances_m(latitude_deg: Floats, longitude_deg: Floats, height_m: Floats) -> Floats:
     """Straight 3-D distances between consecutive points [m], one fewer than points."""
-    return steps_m(earth_centred_m(latitude_deg, longitude_deg, height_m))
+    return place_distances_m(earth_centred_m(latitude_deg, longitude_deg, height_m))
 
 
-def steps_m(places: Floats) -> Floats:
+def place_distances_m(places: Floats) -> Floats:
     """Straight distances between consecutive places [m], one fewer than places."""
     steps = np.diff(places, axis=0)
     return np.asarray(np.sqrt(np.einsum("ij,ij->i", steps, steps)))
@@ -73,10 +75,12 @@ def distance_along_m(places: Floats) -> Floats:
     return np.concatenate([np.zeros(min(1, len(places))), np.cumsum(np.linalg.norm(np.diff(places, axis=0), axis=1))])
 
 
-def distance_m(latitude_a_deg: float, longitude_a_deg: float, latitude_b_deg: float, longitude_b_deg: float) -> float:
-    """Straight distance of two places on the ellipsoid [m]; for what is near."""
+def distance_between_m(
+    latitude_a_deg: float, longitude_a_deg: float, latitude_b_deg: float, longitude_b_deg: float
+) -> float:
+    """Straight distance between two places on the ellipsoid [m], at height zero."""
     pair = np.array([latitude_a_deg, latitude_b_deg]), np.array([longitude_a_deg, longitude_b_deg])
-    return float(distances_m(*pair, np.zeros(2))[0])
+    return float(point_distances_m(*pair, np.zeros(2))[0])
 
 
 def curvature_radii_m(latitude: Floats) -> tuple[Floats, Floats]:
@@ -89,7 +93,7 @@ def curvature_radii_m(latitude: Floats) -> tuple[Floats, Floats]:
 def moved_deg(
     latitude_deg: Floats, longitude_deg: Floats, height_m: Floats, east_m: Floats, north_m: Floats
 ) -> tuple[Floats, Floats]:
-    """Latitude and longitude moved by a vector of the local horizon, small against the radius of the Earth."""
+    """Latitude and longitude [deg] moved by a vector of the local horizon, small against the radius of the Earth."""
     latitude = np.radians(latitude_deg)
     meridian_m, normal_m = curvature_radii_m(latitude)
     return (
@@ -98,14 +102,16 @@ def moved_deg(
     )
 
 
-def sines(latitude_deg: Floats, longitude_deg: Floats) -> tuple[Floats, Floats, Floats, Floats]:
+def sines_and_cosines(latitude_deg: Floats, longitude_deg: Floats) -> tuple[Floats, Floats, Floats, Floats]:
     """Sine and cosine of latitude, sine and cosine of longitude."""
     latitude = np.radians(latitude_deg)
     longitude = np.radians(longitude_deg)
     return np.sin(latitude), np.cos(latitude), np.sin(longitude), np.cos(longitude)
 
 
-def _ecef(sin_lat: Floats, cos_lat: Floats, sin_lon: Floats, cos_lon: Floats, height_m: Floats) -> Floats:
+def _ellipsoid_to_earth_centred_m(
+    sin_lat: Floats, cos_lat: Floats, sin_lon: Floats, cos_lon: Floats, height_m: Floats
+) -> Floats:
     """Earth-fixed coordinates of geodetic ones, on the ellipsoid of WGS 84 [m]."""
     normal_m = SEMI_MAJOR_AXIS_M / np.sqrt(1.0 - ECCENTRICITY_SQUARED * sin_lat * sin_lat)
     ring_m = (normal_m + height_m) * cos_lat

@@ -1,4 +1,4 @@
-"""What is made of something that stays is made once, and kept as long as that."""
+"""The network of oriented net elements of a site: which lead on to which, and what lies within reach."""
 
 from __future__ import annotations
 
@@ -14,12 +14,12 @@ import numpy as np
 import polars as pl
 
 from pipeline.stages.track.chords import Chords
-from pipeline.stages.track.path import Chain, Reach, search
+from pipeline.stages.track.path import Chain, Reach, search_chains
 from pipeline.stages.track.segments import Visit
 from pipeline.stages.track.survey import (
     SurveyedTrack,
     end_places,
-    gaps_m,
+    gap_lengths_m,
     in_pieces,
     pieces_of,
     track_in_parts,
@@ -35,7 +35,7 @@ Made = TypeVar("Made")
 
 
 class Once(Generic[Source, Made]):
-    """A function of one argument that is itself alone (no other is equal to it): a site, a track."""
+    """A function of one argument, a site or a track, whose result is made once and kept as long as that argument."""
 
     def __init__(self, make: Callable[[Source], Made]) -> None:
         self._make = make
@@ -47,12 +47,12 @@ class Once(Generic[Source, Made]):
         return self._made[source]
 
     def keep(self, source: Source, made: Made) -> None:
-        """Whoever has made it already need not have it made again."""
+        """Keep what was made from a source already, so that it need not be made again."""
         self._made[source] = made
 
 
 class Edge(NamedTuple):
-    """A relation to a successor, the gap between both [m], and whether trains may run it forward and backward."""
+    """A relation to a successor `to`, the gap between both [m], and whether trains may run it forward and backward."""
 
     to: int
     gap_m: float
@@ -61,7 +61,7 @@ class Edge(NamedTuple):
 
 
 @frozen
-class Onward:
+class Successors:
     """All relations to successors, as arrays: `first[e] : first[e + 1]` are those of element e."""
 
     first: Ints
@@ -99,14 +99,14 @@ class Network:
     """
 
     track: SurveyedTrack
-    successors: Onward
+    successors: Successors
     parts: Ints
     usable: Bools
     orientable: bool
     _known: dict[int, tuple[float, dict[int, Reach]]] = field(default_factory=dict)
 
     def unsearched(self) -> Network:
-        """The same network without what was looked for in it: no run's answers may depend on runs before it."""
+        """The same network without the results of searches: no run's answers may depend on runs before it."""
         self.chords  # noqa: B018  one for all copies: what it knows of a chain does not depend on who asked
         again = copy.copy(self)
         again._known = {}
@@ -122,26 +122,26 @@ class Network:
 
         `unstated_m`: of points without one.
         """
-        points_m = np.fmax(*(self._stated_m(at, unstated_m) for at in (vertex, vertex + 1)))
+        points_m = np.fmax(*(self._vertex_sigmas_m(at, unstated_m) for at in (vertex, vertex + 1)))
         return np.asarray(np.hypot(points_m, self.chords.sigmas_m(vertex)))
 
-    def most_survey_sigma_m(self, unstated_m: float) -> float:
-        """No segment's sigma is larger [m]."""
+    def largest_survey_sigma_m(self, unstated_m: float) -> float:
+        """A bound of the survey's sigma of all segments [m]; `unstated_m`: of points without one."""
         stated_m = np.fmax.reduce(self.track.sigma_m, initial=unstated_m)
-        return float(np.hypot(stated_m, self.chords.most_m))
+        return float(np.hypot(stated_m, self.chords.largest_sigma_m))
 
-    def _stated_m(self, vertex: Ints, unstated_m: float) -> Floats:
+    def _vertex_sigmas_m(self, vertex: Ints, unstated_m: float) -> Floats:
         """Survey uncertainty of vertices, or another where the survey states none [m]."""
         stated_m = self.track.sigma_m[vertex]
         return np.where(np.isfinite(stated_m), stated_m, unstated_m)
 
     @cached_property
-    def connected(self) -> Ints:
+    def connected_part(self) -> Ints:
         """Number of the part that each net element is connected with, whatever the direction of trains."""
         return np.asarray(self.parts.reshape(-1, 2).min(axis=1))
 
     @cached_property
-    def unbranched(self) -> Ints:
+    def line_of_element(self) -> Ints:
         """Number of the line without a branch that each net element belongs to, however it is cut."""
         from scipy.sparse import coo_array
         from scipy.sparse.csgraph import connected_components
@@ -170,16 +170,16 @@ class Network:
         lengths_m: list[float] = self.track.length_m.tolist()  # searches ask for one at a time
         return lengths_m
 
-    def reach(self, oriented: int, limit_m: float) -> dict[int, Reach]:
-        """Everything whose entry lies within `limit_m` beyond the exit of an oriented element, by the shortest route.
+    def within_reach(self, oriented: int, limit_m: float) -> dict[int, Reach]:
+        """The shortest chain to every element whose entry lies within `limit_m` beyond the exit of an oriented element.
 
-        An element is reached from itself over a loop.
+        By the number of the oriented element. An element is reached from itself over a loop.
         """
         known = self._known.get(oriented)
         if known is None or known[0] < limit_m:
             limit_m = max(limit_m, MIN_REACH_M)
-            begin = Chain.behind(self, oriented)
-            found = search(
+            begin = Chain.ending_at_zero(self, oriented)
+            found = search_chains(
                 self,
                 begin,
                 limit_m,
@@ -190,7 +190,7 @@ class Network:
             self._known[oriented] = known
         return known[1]
 
-    def linked(self, first: int, second: int) -> bool:
+    def are_linked(self, first: int, second: int) -> bool:
         """Whether one is a direct successor of the other, in either order."""
         return any(
             edge.to == there for here, there in ((first, second), (second, first)) for edge in self.successors[here]
@@ -200,8 +200,8 @@ class Network:
         """The relation from an oriented element to a successor."""
         return next(edge for edge in self.successors[here] if edge.to == to)
 
-    def linked_ends(self) -> Bools:
-        """Whether a relation leads on from each element's start and from its end."""
+    def have_successors(self) -> Bools:
+        """Whether a relation leads on from each element's start and from its end; shape (elements, 2)."""
         onward = np.diff(self.successors.first) > 0
         return onward.reshape(-1, 2)[:, ::-1]
 
@@ -217,7 +217,7 @@ def network_of(track: SurveyedTrack, links: pl.DataFrame) -> Network:
     element_a, position_a = _linked_ends(track, usable_links, "a")
     element_b, position_b = _linked_ends(track, usable_links, "b")
     ends = end_places(track)
-    gap_m = gaps_m(ends[element_a, position_a], ends[element_b, position_b])
+    gap_m = gap_lengths_m(ends[element_a, position_a], ends[element_b, position_b])
     navigability = usable_links["navigability"].cast(pl.String)
     there = navigability.is_in([Navigability.AB.value, Navigability.BOTH.value]).to_numpy()
     back = navigability.is_in([Navigability.BA.value, Navigability.BOTH.value]).to_numpy()
@@ -226,19 +226,19 @@ def network_of(track: SurveyedTrack, links: pl.DataFrame) -> Network:
     # Piece by piece first, then each relation there and back, in their order.
     piece = np.flatnonzero(np.array([one == other for one, other in itertools.pairwise(track.ids)], dtype=np.bool_))
     joined = np.ones(2 * len(piece), dtype=np.bool_)
-    onward = _onward(
+    onward = _successors_of(
         2 * len(track.ids),
-        np.concatenate([_in_turn(2 * piece, 2 * piece + 3), _in_turn(leaving, entering ^ 1)]),
-        np.concatenate([_in_turn(2 * piece + 2, 2 * piece + 1), _in_turn(entering, leaving ^ 1)]),
+        np.concatenate([_interleaved(2 * piece, 2 * piece + 3), _interleaved(leaving, entering ^ 1)]),
+        np.concatenate([_interleaved(2 * piece + 2, 2 * piece + 1), _interleaved(entering, leaving ^ 1)]),
         np.concatenate([np.zeros(2 * len(piece)), np.repeat(gap_m, 2)]),
-        np.concatenate([joined, _in_turn(there, back)]),
-        np.concatenate([joined, _in_turn(back, there)]),
+        np.concatenate([joined, _interleaved(there, back)]),
+        np.concatenate([joined, _interleaved(back, there)]),
     )
-    return _oriented(track, onward)
+    return _with_orientations(track, onward)
 
 
-def _in_turn(first: np.ndarray, second: np.ndarray) -> np.ndarray:
-    """Rows of two columns in turn."""
+def _interleaved(first: np.ndarray, second: np.ndarray) -> np.ndarray:
+    """Values of two columns in turn."""
     return np.column_stack([first, second]).ravel()
 
 
@@ -253,7 +253,7 @@ def _linked_ends(track: SurveyedTrack, links: pl.DataFrame, side: str) -> tuple[
     return ints(element), ints(both["end"])
 
 
-def _onward(count: int, here: Ints, to: Ints, gap_m: Floats, forward: Bools, backward: Bools) -> Onward:
+def _successors_of(count: int, here: Ints, to: Ints, gap_m: Floats, forward: Bools, backward: Bools) -> Successors:
     """Relations in the order given; one given twice, or once from each side, counts once, with what either allows."""
     # `here * count + to` is one number for each pair of ends.
     _, begins, same = np.unique(here * count + to, return_index=True, return_inverse=True)
@@ -262,10 +262,10 @@ def _onward(count: int, here: Ints, to: Ints, gap_m: Floats, forward: Bools, bac
     np.logical_or.at(allowed[1], same, backward)
     order = np.lexsort((begins, here[begins]))
     first = np.searchsorted(here[begins[order]], np.arange(count + 1))
-    return Onward(first, to[begins[order]], gap_m[begins[order]], allowed[0][order], allowed[1][order])
+    return Successors(first, to[begins[order]], gap_m[begins[order]], allowed[0][order], allowed[1][order])
 
 
-def _oriented(track: SurveyedTrack, onward: Onward) -> Network:
+def _with_orientations(track: SurveyedTrack, onward: Successors) -> Network:
     """The network over these relations, with the orientations in use of each connected part."""
     part = connected_parts(len(onward), onward.here, onward.to)
     turned = part.reshape(-1, 2)[:, ::-1].ravel()
@@ -296,7 +296,7 @@ def connected_parts(count: int, here: Ints, there: Ints) -> Ints:
 _FORWARD = "AB"
 
 
-def visits_of(track: SurveyedTrack, route: pl.DataFrame) -> list[Visit]:
+def route_visits(track: SurveyedTrack, route: pl.DataFrame) -> list[Visit]:
     """The route's elements in order, each in its sense."""
     return [
         Visit(track.index[name], direction == _FORWARD)
@@ -304,7 +304,7 @@ def visits_of(track: SurveyedTrack, route: pl.DataFrame) -> list[Visit]:
     ]
 
 
-def network_along(track: SurveyedTrack, visits: list[Visit]) -> Network:
+def network_of_route(track: SurveyedTrack, visits: list[Visit]) -> Network:
     """A network of nothing but the route, in pieces; an element passed twice is there twice, one after the other."""
     pieces = pieces_of(track)
     parts = [(visit, part) for visit in visits for part in pieces[visit.element][:: 1 if visit.forward else -1]]
@@ -315,21 +315,21 @@ def network_along(track: SurveyedTrack, visits: list[Visit]) -> Network:
     return Network(split, onward, connected_parts(len(onward), onward.here, onward.to), usable, orientable=True)
 
 
-def _onward_along_route(track: SurveyedTrack, visits: Sequence[Visit]) -> Onward:
+def _onward_along_route(track: SurveyedTrack, visits: Sequence[Visit]) -> Successors:
     """Successors by the relations that the route uses, and no other."""
     element = np.array([visit.element for visit in visits], dtype=np.int64)
     forward = np.array([visit.forward for visit in visits], dtype=np.int64)
     ends = end_places(track)
-    gap_m = gaps_m(ends[element[:-1], forward[:-1]], ends[element[1:], 1 - forward[1:]])
+    gap_m = gap_lengths_m(ends[element[:-1], forward[:-1]], ends[element[1:], 1 - forward[1:]])
     oriented = 2 * element + 1 - forward
-    here = _in_turn(oriented[:-1], oriented[1:] ^ 1)
-    there = _in_turn(oriented[1:], oriented[:-1] ^ 1)
+    here = _interleaved(oriented[:-1], oriented[1:] ^ 1)
+    there = _interleaved(oriented[1:], oriented[:-1] ^ 1)
     both = np.ones(len(here), dtype=np.bool_)
-    return _onward(2 * len(track.ids), here, there, np.repeat(gap_m, 2), both, both)
+    return _successors_of(2 * len(track.ids), here, there, np.repeat(gap_m, 2), both, both)
 
 
 @Once
-def surveyed(site: Site) -> SurveyedTrack:
+def surveyed_track(site: Site) -> SurveyedTrack:
     """The track of a site as arrays."""
     return track_of(site.track)
 
@@ -337,9 +337,9 @@ def surveyed(site: Site) -> SurveyedTrack:
 @Once
 def network_in_pieces(site: Site) -> Network:
     """The network of a site, or of nothing but its route, with elements that turn round in pieces that do not."""
-    track = surveyed(site)
+    track = surveyed_track(site)
     if site.route is not None:
-        return network_along(track, visits_of(track, site.route))
+        return network_of_route(track, route_visits(track, site.route))
     pieces = in_pieces(track)
     return site_network(site) if pieces is track else network_of(pieces, site.links)
 
@@ -347,7 +347,7 @@ def network_in_pieces(site: Site) -> Network:
 @Once
 def site_network(site: Site) -> Network:
     """The network of a site; where it gives a route, the elements of the survey with its relations alone."""
-    track = surveyed(site)
+    track = surveyed_track(site)
     if site.route is None:
         return network_of(track, site.links)
-    return _oriented(track, _onward_along_route(track, visits_of(track, site.route)))
+    return _with_orientations(track, _onward_along_route(track, route_visits(track, site.route)))

@@ -1,4 +1,4 @@
-"""Chains of oriented net elements with one coordinate, and the one search for them."""
+"""Chains of oriented net elements with one coordinate, the search for them, and the path of a run."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ import numpy.typing as npt
 import polars as pl
 
 from pipeline.stages.track.geodesy import Points
-from pipeline.stages.track.segments import Feet, Leg, nearest_on_leg, no_feet, path_at, segments_at
+from pipeline.stages.track.segments import Feet, Leg, nearest_on_leg, path_at, segments_at, unknown_feet
 from pipeline.stages.track.survey import MEASURE_TOLERANCE_M, SurveyedTrack
 from schemas.arrays import Bools, Floats, Ints, floats
 from schemas.enums import BaliseDirection, BaliseKind
@@ -42,48 +42,51 @@ class Chain:
     shared: int | None = None
 
     @classmethod
-    def behind(cls, network: Network, oriented: int) -> Chain:
+    def ending_at_zero(cls, network: Network, oriented: int) -> Chain:
         """One element whose exit is at 0."""
         return cls((oriented,), (-network.length_m(oriented),))
 
     @property
-    def high(self) -> int:
+    def last_number(self) -> int:
         """Number of its last element."""
         return self.low + len(self.oriented) - 1
 
     @property
-    def between(self) -> tuple[int, ...]:
-        """All but the first and the last."""
+    def inner_elements(self) -> tuple[int, ...]:
+        """Its elements but for the first and the last."""
         return self.oriented[1:-1]
 
     def exit_m(self, network: Network) -> float:
         """Coordinate at which the last element is left [m]."""
         return self.entry_m[-1] + network.length_m(self.oriented[-1])
 
-    def after(self, network: Network, edge: Edge) -> Chain:
+    def extended_by(self, network: Network, edge: Edge) -> Chain:
         """The chain carried on over a relation from its last element."""
         entry_m = self.exit_m(network) + edge.gap_m
         return Chain((*self.oriented, edge.to), (*self.entry_m, entry_m), self.low, self.shared)
 
-    def before(self, network: Network, oriented: int) -> Chain:
+    def preceded_by(self, network: Network, oriented: int) -> Chain:
         """The chain with an element before its first, that leads to it."""
         entry_m = self.entry_m[0] - network.edge(oriented, self.oriented[0]).gap_m - network.length_m(oriented)
         return Chain((oriented, *self.oriented), (entry_m, *self.entry_m), self.low - 1, self.shared)
 
-    def part(self, first: int, last: int, shared: int) -> Chain:
+    def part_between(self, first: int, last: int, shared: int) -> Chain:
         """Its elements of some numbers, as the beginning of a chain after this one."""
         inside = slice(first - self.low, last - self.low + 1)
         return Chain(self.oriented[inside], self.entry_m[inside], first, shared)
 
-    def turned(self, network: Network) -> Chain:
+    def in_other_direction(self, network: Network) -> Chain:
         """The same elements run in the other direction; coordinate and numbers change their signs."""
         pairs = zip(self.oriented, self.entry_m, strict=True)
         entry_m = [-(entry_m + network.length_m(oriented)) for oriented, entry_m in pairs]
         around = tuple(oriented ^ 1 for oriented in reversed(self.oriented))
-        return Chain(around, tuple(reversed(entry_m)), -self.high, None if self.shared is None else -self.shared)
+        return Chain(around, tuple(reversed(entry_m)), -self.last_number, None if self.shared is None else -self.shared)
 
-    def route(self, network: Network, numbers: dict[str, int] | None = None) -> RoutePath:
-        """`numbers`: net elements as the caller counts them, where the network has them in pieces."""
+    def as_route(self, network: Network, numbers: dict[str, int] | None = None) -> RoutePath:
+        """The chain as arrays.
+
+        `numbers`: net elements as the caller counts them, where the network has them in pieces.
+        """
         oriented = np.array(self.oriented, dtype=np.int64)
         element = oriented // 2
         track = network.track
@@ -97,7 +100,7 @@ class Chain:
         )
 
 
-def moved_on(chains: list[Chain], network: Network, at: int, oriented: int, sense: int) -> int:
+def move_along(chains: list[Chain], network: Network, at: int, oriented: int, sense: int) -> int:
     """The number of the element on the last chain that a train comes to from number `at`, ahead (+1) or behind (-1).
 
     The chain grows at its ends; where the train, having turned, takes another branch than that which it came from, a
@@ -105,14 +108,16 @@ def moved_on(chains: list[Chain], network: Network, at: int, oriented: int, sens
     """
     chain = chains[-1]
     number = at + sense
-    inside = chain.low <= number <= chain.high
+    inside = chain.low <= number <= chain.last_number
     if inside and chain.oriented[number - chain.low] == oriented:
         return number
     if inside:
-        chain = chain.part(chain.low, at, at) if sense > 0 else chain.part(at, chain.high, at)
+        chain = chain.part_between(chain.low, at, at) if sense > 0 else chain.part_between(at, chain.last_number, at)
         chains.append(chain)
     last = chain.oriented[-1]
-    chains[-1] = chain.after(network, network.edge(last, oriented)) if sense > 0 else chain.before(network, oriented)
+    chains[-1] = (
+        chain.extended_by(network, network.edge(last, oriented)) if sense > 0 else chain.preceded_by(network, oriented)
+    )
     return number
 
 
@@ -125,16 +130,16 @@ class Reach(NamedTuple):
 
     @property
     def distance_m(self) -> float:
-        """Coordinate at which the last element is entered."""
+        """Coordinate at which the last element is entered [m]."""
         return self.chain.entry_m[-1]
 
-    def after(self, network: Network, edge: Edge) -> Reach:
+    def extended_by(self, network: Network, edge: Edge) -> Reach:
         """Carried on over a relation."""
         barred = self.barred_forward + (not edge.forward), self.barred_backward + (not edge.backward)
-        return Reach(self.chain.after(network, edge), *barred)
+        return Reach(self.chain.extended_by(network, edge), *barred)
 
 
-def search(
+def search_chains(
     network: Network,
     begin: Chain,
     until_m: float,
@@ -160,7 +165,7 @@ def search(
         exit_m = found.chain.exit_m(network)
         for edge in onward(found.chain):
             if exit_m + edge.gap_m <= until_m:
-                further = found.after(network, edge)
+                further = found.extended_by(network, edge)
                 barred = min(further.barred_forward, further.barred_backward)
                 order_m = further.distance_m + barred * BARRED_DETOUR_M
                 heapq.heappush(waiting, (order_m, edge.to, next(number), further))
@@ -228,7 +233,7 @@ class RoutePath:
         """Coordinate at which each element is left [m]."""
         return self.entry_m + self.high_m - self.low_m
 
-    def coordinate(self, element: Ints, measure_m: Floats, near_m: Floats) -> tuple[Floats, Ints]:
+    def coordinates_of(self, element: Ints, measure_m: Floats, near_m: Floats) -> tuple[Floats, Ints]:
         """Coordinate [m] of places, NaN where not on the route; +1 where it grows with the measure, else -1.
 
         Of several visits the one nearest to `near_m` is meant: one more circuit of a ring is no error of place.
@@ -262,7 +267,7 @@ class RoutePath:
         measure = np.where(forward, self.low_m[visit] + since, self.high_m[visit] - since)
         return self.element[visit], measure, np.where(forward, 1, -1)
 
-    def places(self, element: Ints, measure_m: Floats) -> tuple[Ints, Floats, Ints]:
+    def visits_of_places(self, element: Ints, measure_m: Floats) -> tuple[Ints, Floats, Ints]:
         """All visits of some places, but for what lists round: which place, coordinate [m], sense of the measure."""
         holds = self.element[:, None] == element
         holds &= (self.low_m[:, None] - MEASURE_TOLERANCE_M <= measure_m) & (
@@ -273,13 +278,13 @@ class RoutePath:
         since = np.where(self.forward[visit], measure - self.low_m[visit], self.high_m[visit] - measure)
         return place, self.entry_m[visit] + since, np.where(self.forward[visit], 1, -1)
 
-    def covers(self, at_m: Floats) -> Bools:
-        """The coordinate lies on the route, not beyond its ends."""
+    def covers_coordinates(self, at_m: Floats) -> Bools:
+        """Whether each coordinate lies on the route, not beyond its ends."""
         inside: Bools = (at_m >= self.entry_m[0]) & (at_m <= self.exit_m[-1])
         return inside
 
 
-def routes_of(track: SurveyedTrack, legs: Sequence[Leg]) -> list[RoutePath]:
+def legs_as_routes(track: SurveyedTrack, legs: Sequence[Leg]) -> list[RoutePath]:
     """Legs as routes whose coordinate is `path_m`; net elements by their numbers in the track."""
     routes = []
     for leg in legs:
@@ -303,7 +308,7 @@ class TravelledPath:
     track: SurveyedTrack
     legs: tuple[Leg, ...]
 
-    def elements(self) -> list[str]:
+    def element_names(self) -> list[str]:
         """Net elements in order of growing path, leg by leg; one on both sides of a leg change stands once."""
         names: list[str] = []
         for leg in self.legs:
@@ -335,19 +340,19 @@ class TravelledPath:
             measure[rows] = route_leg.measure_start_m[segment] + fraction * span
         return element, measure
 
-    def feet(self, points: Points, leg: Ints, known: Bools, near_path_m: Floats | None = None) -> Feet:
+    def nearest_feet(self, points: Points, leg: Ints, known: Bools, near_path_m: Floats | None = None) -> Feet:
         """The nearest place of each known point on its leg.
 
         `near_path_m` tells passages of the same place apart; it never moves a point that has only one, so jumps stay.
         """
-        feet = no_feet(len(points))
+        feet = unknown_feet(len(points))
         for index, route_leg in enumerate(self.legs):
             rows = np.flatnonzero((leg == index) & known)
             near = None if near_path_m is None else near_path_m[rows]
             feet.put(rows, nearest_on_leg(points.take(rows), route_leg, near))
         return feet
 
-    def places(self, leg: Ints, feet: Feet, height_m: Floats) -> tuple[Floats, Floats]:
+    def path_positions(self, leg: Ints, feet: Feet, height_m: Floats) -> tuple[Floats, Floats]:
         """Feet on the legs as path positions, and heights over the track [m]; NaN where not known."""
         path_m, vertical_m = np.full((2, len(leg)), np.nan)
         for index, route_leg in enumerate(self.legs):
@@ -358,12 +363,12 @@ class TravelledPath:
             vertical_m[rows] = height_m[rows] - route_leg.height_start_m[part.segment] - part.fraction * rise
         return path_m, vertical_m
 
-    def routes(self, numbers: dict[str, int]) -> list[RoutePath]:
+    def routes_by_leg(self, numbers: dict[str, int]) -> list[RoutePath]:
         """The legs as routes whose coordinate is `path_m`; `numbers`: net elements as the caller counts them."""
         number = np.array([numbers[name] for name in self.track.ids], dtype=np.int64)
-        return [replace(route, element=number[route.element]) for route in routes_of(self.track, self.legs)]
+        return [replace(route, element=number[route.element]) for route in legs_as_routes(self.track, self.legs)]
 
-    def balises(self, balises: pl.DataFrame | None) -> pl.DataFrame:
+    def balises_on_path(self, balises: pl.DataFrame | None) -> pl.DataFrame:
         """Balises on the path with path position and `sense` (of the measure along it), in order of leg and position.
 
         `valid_direction`: the direction of travel along growing path in which a virtual one is valid, +1 or -1; 0 both.
@@ -375,8 +380,8 @@ class TravelledPath:
             return pl.DataFrame(schema=BALISE_COLUMNS)
         element = balises["netelement_id"].replace_strict(self.track.index, default=-1, return_dtype=pl.Int64)
         parts = []
-        for leg, route in enumerate(self.routes(self.track.index)):
-            place, path_m, sense = route.places(element.to_numpy(), floats(balises, "measure_m"))
+        for leg, route in enumerate(self.routes_by_leg(self.track.index)):
+            place, path_m, sense = route.visits_of_places(element.to_numpy(), floats(balises, "measure_m"))
             along_path = valid_along_measure(balises)[place] * pl.Series(sense)
             on_leg = balises[place].with_columns(leg=pl.lit(leg), path_m=path_m, sense=sense)
             parts.append(on_leg.with_columns(valid_direction=along_path))

@@ -1,4 +1,4 @@
-"""Polylines on the ellipsoid, and the nearest place on them."""
+"""Polylines on the ellipsoid with the nearest place on them, and the legs of a path."""
 
 from __future__ import annotations
 
@@ -31,18 +31,18 @@ class Box:
     low_m: Floats
     high_m: Floats
 
-    def touched_by(self, start: Floats, end: Floats) -> Ints:
+    def segments_touching(self, start: Floats, end: Floats) -> Ints:
         """Segments that may come into it: all that do are among them."""
         outside = ((np.maximum(start, end) < self.low_m) | (np.minimum(start, end) > self.high_m)).any(axis=1)
         return np.flatnonzero(~outside)
 
-    def holds(self, other: Box) -> bool:
+    def contains(self, other: Box) -> bool:
         """Whether another box lies within this one."""
         return bool((self.low_m <= other.low_m).all() and (self.high_m >= other.high_m).all())
 
 
 def box_about(places: Floats, reach_m: float) -> Box:
-    """`places`: one at least, earth-centred [m]."""
+    """The box that holds everything within a reach [m] of these places (one at least, earth-centred [m])."""
     return Box(places.min(axis=0) - reach_m, places.max(axis=0) + reach_m)
 
 
@@ -63,24 +63,24 @@ class Polyline:
         """Distance [m] of each place from the nearest sample, and the segment of that."""
         if len(places) == 0:
             return np.zeros(0), np.zeros(0, dtype=np.int64)
-        if not self._looked or not self._looked[0][0].holds(box_about(places, _ABOUT_M)):
+        if not self._looked or not self._looked[0][0].contains(box_about(places, _ABOUT_M)):
             box = box_about(places, 2.0 * _ABOUT_M)
-            rows = box.touched_by(self.start, self.end)
+            rows = box.segments_touching(self.start, self.end)
             # Where nothing is near, the nearest is anywhere.
             rows = rows if len(rows) else np.arange(len(self))
-            tree, segment = Polyline(self.start[rows], self.end[rows]).samples
+            tree, segment = Polyline(self.start[rows], self.end[rows]).sample_tree
             self._looked[:] = [(box, tree, rows[segment])]
         _, tree, segment = self._looked[0]
         distance_m, sample = tree.query(places)
         if (distance_m <= _ABOUT_M).all():
             return distance_m, segment[sample]
         # A sample elsewhere may be nearer than that.
-        tree, segment = self.samples
+        tree, segment = self.sample_tree
         distance_m, sample = tree.query(places)
         return distance_m, segment[sample]
 
     @cached_property
-    def samples(self) -> tuple[Tree, Ints]:
+    def sample_tree(self) -> tuple[Tree, Ints]:
         """A search tree over points at most `SAMPLE_SPACING_M` apart, and the segment of each."""
         from scipy.spatial import cKDTree  # takes long to load, and a log needs none
 
@@ -120,8 +120,8 @@ class Feet:
         self.distance_m[rows] = replacement.distance_m
 
 
-def no_feet(count: int) -> Feet:
-    """Feet to be filled with `put`."""
+def unknown_feet(count: int) -> Feet:
+    """So many feet that are not known, to be filled with `put`."""
     unknown = np.full(count, np.nan)
     return Feet(np.zeros(count, dtype=np.int64), unknown, unknown.copy(), unknown.copy())
 
@@ -129,17 +129,17 @@ def no_feet(count: int) -> Feet:
 def nearest(points: Points, line: Polyline) -> Feet:
     """The nearest place on the line: nearest sample, then downhill over neighbouring segments."""
     if len(points) == 0:
-        return no_feet(0)
+        return unknown_feet(0)
     _, segment = line.nearest_sample(points.surface)
-    return held_to_line(downhill(points, line, segment), len(line))
+    return limit_to_line(walk_to_nearest(points, line, segment), len(line))
 
 
-def downhill(points: Points, line: Polyline, segment: Ints, line_of: Ints | None = None) -> Feet:
-    """The nearest place from a first guess, walking along the line while that gets nearer; `fraction` is not limited.
+def walk_to_nearest(points: Points, line: Polyline, segment: Ints, line_of: Ints | None = None) -> Feet:
+    """The nearest place from a first guess, walking along the line while that gets nearer.
 
-    `line_of`: per segment the line that it belongs to, where there are several.
+    `fraction` is not limited.
     """
-    feet = on_segments(points, line, segment)
+    feet = project_on_segments(points, line, segment)
     active = np.flatnonzero((feet.fraction < 0) | (feet.fraction > 1))
     while len(active):
         step = np.where(feet.fraction[active] < 0, -1, 1)
@@ -151,7 +151,7 @@ def downhill(points: Points, line: Polyline, segment: Ints, line_of: Ints | None
             same = line_of[neighbour] == line_of[feet.segment[active]]
             active = active[same]
             neighbour = neighbour[same]
-        trial = on_segments(points.take(active), line, neighbour)
+        trial = project_on_segments(points.take(active), line, neighbour)
         better = np.flatnonzero(trial.distance_m < feet.distance_m[active] - 1e-9)
         active = active[better]
         feet.put(active, trial.take(better))
@@ -159,14 +159,14 @@ def downhill(points: Points, line: Polyline, segment: Ints, line_of: Ints | None
     return feet
 
 
-def on_segments(points: Points, line: Polyline, segment: Ints) -> Feet:
+def project_on_segments(points: Points, line: Polyline, segment: Ints) -> Feet:
     """Projection of each point on its segment, in the point's tangent plane; `fraction` is not limited."""
     to_start = line.start.take(segment, axis=0) - points.surface
     to_end = line.end.take(segment, axis=0) - points.surface
-    x = _dot(to_start, points.east)
-    y = _dot(to_start, points.north)
-    dx = _dot(to_end, points.east) - x
-    dy = _dot(to_end, points.north) - y
+    x = _row_products(to_start, points.east)
+    y = _row_products(to_start, points.north)
+    dx = _row_products(to_end, points.east) - x
+    dy = _row_products(to_end, points.north) - y
     # Foot of the perpendicular from the origin (the point): t = -(s . d) / |d|^2; left offset = (s x d) / |d|.
     square = np.maximum(dx * dx + dy * dy, 1e-18)
     fraction = -(x * dx + y * dy) / square
@@ -176,7 +176,7 @@ def on_segments(points: Points, line: Polyline, segment: Ints) -> Feet:
     return Feet(np.array(segment), fraction, offset, distance)
 
 
-def held_to_line(feet: Feet, count: int) -> Feet:
+def limit_to_line(feet: Feet, count: int) -> Feet:
     """Feet held to the line: at a corner the vertex is nearest; only beyond the ends the line goes on."""
     low = np.where(feet.segment == 0, -np.inf, 0.0)
     high = np.where(feet.segment == count - 1, np.inf, 1.0)
@@ -187,7 +187,7 @@ def held_to_line(feet: Feet, count: int) -> Feet:
     return Feet(feet.segment, fraction, offset, feet.distance_m)
 
 
-def _dot(a: Floats, b: Floats) -> Floats:
+def _row_products(a: Floats, b: Floats) -> Floats:
     """Scalar products row by row: shapes (n, 3), (n, 3) to (n,)."""
     return np.asarray(np.einsum("ij,ij->i", a, b))
 
@@ -235,7 +235,7 @@ class Leg:
     @cached_property
     def returns(self) -> bool:
         """Whether the leg comes back to a place where it was: a loop, or an element passed twice."""
-        return _returns(self.line, self.path_start_m)
+        return _comes_back(self.line, self.path_start_m)
 
     @property
     def start_m(self) -> float:
@@ -259,12 +259,12 @@ def leg_of(track: SurveyedTrack, visits: Sequence[Visit], start_m: float = 0.0) 
     Gaps that the site check let pass count as straight track, so that path and odometer agree; an offset sideways
     between two elements adds no length.
     """
-    vertex = np.concatenate([_vertices(track, visit) for visit in visits])
+    vertex = np.concatenate([_vertices_in_order(track, visit) for visit in visits])
     count = np.array([track.first[visit.element + 1] - track.first[visit.element] for visit in visits])
     visit = np.repeat(np.arange(len(visits)), count)
     places = points_of(track.latitude_deg[vertex], track.longitude_deg[vertex])
     border = visit[1:] != visit[:-1]
-    gap = _gaps(places.surface, border)
+    gap = _gap_lengths_m(places.surface, border)
     measure = track.measure_m[vertex]
     grown = np.where(border, gap, np.abs(np.diff(measure)))
     path = start_m + np.concatenate([[0.0], np.cumsum(grown)])
@@ -272,7 +272,7 @@ def leg_of(track: SurveyedTrack, visits: Sequence[Visit], start_m: float = 0.0) 
     head = kept
     tail = kept + 1
     short = path[tail] - path[head] < GAP_COUNTS_M
-    surface = _without_scatter(places.surface, path, path[np.concatenate([head[short], tail[short]])])
+    surface = _smoothed_vertices(places.surface, path, path[np.concatenate([head[short], tail[short]])])
     heading, turn = _headings(places.take(head), surface.take(tail, axis=0) - surface.take(head, axis=0))
     height = track.height_m[vertex]
     sigma = track.sigma_m[vertex]
@@ -294,8 +294,8 @@ def leg_of(track: SurveyedTrack, visits: Sequence[Visit], start_m: float = 0.0) 
     )
 
 
-def shifted(leg: Leg, by_m: float) -> Leg:
-    """The same leg with its path position moved on."""
+def shift_leg(leg: Leg, by_m: float) -> Leg:
+    """The same leg with its path position moved on by so much [m]."""
     return replace(leg, path_start_m=leg.path_start_m + by_m, path_end_m=leg.path_end_m + by_m)
 
 
@@ -331,17 +331,17 @@ def _prefer_hint(point: Points, leg: Leg, hint_m: float, row: int, feet: Feet) -
     nearest_m = float(path_at(leg, feet.take(np.array([row])))[0])
     reach_m = max(HINT_WINDOW_M, abs(nearest_m - hint_m))
     inside = np.flatnonzero((leg.path_end_m >= hint_m - reach_m) & (leg.path_start_m <= hint_m + reach_m))
-    trial = on_segments(point.take(np.zeros(len(inside), dtype=np.int64)), leg.line, inside)
+    trial = project_on_segments(point.take(np.zeros(len(inside), dtype=np.int64)), leg.line, inside)
     same = np.flatnonzero(trial.distance_m <= feet.distance_m[row] + SAME_PLACE_M)
     if len(same) == 0:
         return
     at_m = path_at(leg, trial.take(same))
     near = same[np.abs(at_m - at_m[np.argmin(np.abs(at_m - hint_m))]) <= HINT_WINDOW_M]
     best = int(near[np.argmin(trial.distance_m[near])])
-    feet.put(np.array([row]), held_to_line(trial.take(np.array([best])), len(leg.line)))
+    feet.put(np.array([row]), limit_to_line(trial.take(np.array([best])), len(leg.line)))
 
 
-def _returns(line: Polyline, path_start_m: Floats) -> bool:
+def _comes_back(line: Polyline, path_start_m: Floats) -> bool:
     """Whether two points far apart along the line lie in the same place."""
     from scipy.spatial import cKDTree  # takes long to load, and a log needs none
 
@@ -352,29 +352,29 @@ def _returns(line: Polyline, path_start_m: Floats) -> bool:
     return bool((np.abs(path_m[pairs[:, 0]] - path_m[pairs[:, 1]]) > HINT_WINDOW_M).any())
 
 
-def _gaps(surface: Floats, border: Bools) -> Floats:
+def _gap_lengths_m(surface: Floats, border: Bools) -> Floats:
     """Length of track that is missing between consecutive vertices [m]; zero but at borders of elements."""
     gap = np.zeros(border.size)
     at = np.flatnonzero(border)
-    along = _unit(surface[at] - surface[at - 1]) + _unit(surface[at + 2] - surface[at + 1])
-    missing = np.einsum("ij,ij->i", surface[at + 1] - surface[at], _unit(along))
+    along = _unit_vectors(surface[at] - surface[at - 1]) + _unit_vectors(surface[at + 2] - surface[at + 1])
+    missing = np.einsum("ij,ij->i", surface[at + 1] - surface[at], _unit_vectors(along))
     gap[at] = np.where(missing > GAP_COUNTS_M, missing, 0.0)
     return gap
 
 
-def _unit(vectors: Floats) -> Floats:
+def _unit_vectors(vectors: Floats) -> Floats:
     """Vectors of length 1, shape (n, 3); of no length where they had none."""
     length = np.linalg.norm(vectors, axis=1, keepdims=True)
     return np.asarray(np.divide(vectors, length, out=np.zeros_like(vectors), where=length > 0.0))
 
 
-def _vertices(track: SurveyedTrack, visit: Visit) -> Ints:
+def _vertices_in_order(track: SurveyedTrack, visit: Visit) -> Ints:
     """Vertices of an element in the order in which the path runs over them."""
     part = np.arange(track.first[visit.element], track.first[visit.element + 1])
     return part if visit.forward else part[::-1]
 
 
-def _without_scatter(surface: Floats, path_m: Floats, short_m: Floats) -> Floats:
+def _smoothed_vertices(surface: Floats, path_m: Floats, short_m: Floats) -> Floats:
     """Vertices at these path positions moved onto the chord of the line about them; not the ends of the leg."""
     inner = np.isin(path_m, short_m) & (path_m > path_m[0]) & (path_m < path_m[-1])
     rows = np.flatnonzero(inner)

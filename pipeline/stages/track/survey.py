@@ -15,7 +15,7 @@ from functools import cached_property
 import numpy as np
 import polars as pl
 
-from pipeline.stages.track.geodesy import distances_m, earth_centred_m, steps_m
+from pipeline.stages.track.geodesy import earth_centred_m, place_distances_m, point_distances_m
 from schemas.arrays import Floats, Ints, floats, ints
 from schemas.frozen import frozen
 
@@ -69,7 +69,7 @@ class SurveyedTrack:
         if len(known):
             places = places.copy()
             places[known] = earth_centred_m(self.latitude_deg[known], self.longitude_deg[known], self.height_m[known])
-        step_m = steps_m(places)
+        step_m = place_distances_m(places)
         measure_m = np.zeros(len(self.latitude_deg))
         points = np.diff(self.first)
         for count in np.unique(points).tolist():
@@ -78,7 +78,7 @@ class SurveyedTrack:
             measure_m[begin + np.arange(1, count)] = np.cumsum(step_m[begin + np.arange(count - 1)], axis=1)
         return measure_m
 
-    def measured(self, measure_m: Floats) -> SurveyedTrack:
+    def with_measures(self, measure_m: Floats) -> SurveyedTrack:
         """The same elements with these measures [m]."""
         length_m = measure_m[self.first[1:] - 1] - measure_m[self.first[:-1]]
         again = replace(self, measure_m=measure_m, length_m=length_m)
@@ -86,16 +86,13 @@ class SurveyedTrack:
         vars(again).update(surface=self.surface, geometric_m=self.geometric_m)
         return again
 
-    def along_m(self, oriented: int, measure_m: float) -> float:
-        """Distance of a measure from where the oriented element (`Network`) is entered [m]."""
+    def distance_from_entry_m(self, oriented: int, measure_m: float) -> float:
+        """Distance from where the oriented element (`Network`) is entered to a measure [m]."""
         element, against = divmod(oriented, 2)
         return float(self.end_m[element] - measure_m if against else measure_m - self.begin_m[element])
 
-    def holding(self, balises: pl.DataFrame) -> tuple[Ints, Ints]:
-        """Pairs of balise (its row) and net element: those that lie on it, or but for what lists round.
-
-        Of an element in pieces each piece that holds the balise.
-        """
+    def elements_holding(self, balises: pl.DataFrame) -> tuple[Ints, Ints]:
+        """Pairs of balise (its row) and net element on which it lies, half a metre beyond an end included."""
         elements = pl.DataFrame(
             {
                 "netelement_id": pl.Series(self.ids, dtype=pl.String),
@@ -111,11 +108,11 @@ class SurveyedTrack:
         )
         return ints(pairs["_balise"]), ints(pairs["_element"])
 
-    def vertices(self, element: int) -> slice:
+    def vertex_range(self, element: int) -> slice:
         """The vertices of an element."""
         return slice(int(self.first[element]), int(self.first[element + 1]))
 
-    def end(self, element: int, position: int) -> int:
+    def end_vertex(self, element: int, position: int) -> int:
         """Vertex at an end of an element: 0 its start, 1 its end."""
         return int(self.first[element]) if position == 0 else int(self.first[element + 1]) - 1
 
@@ -130,23 +127,23 @@ class SurveyedTrack:
     def elements(self) -> Iterator[tuple[int, str, slice]]:
         """Number, name and vertices of each element."""
         for element, name in enumerate(self.ids):
-            yield element, name, self.vertices(element)
+            yield element, name, self.vertex_range(element)
 
 
 def track_of(frame: pl.DataFrame) -> SurveyedTrack:
     """The track of a site's `track` table; points of an element stay in their order."""
-    frame = by_element(frame)
+    frame = sort_by_element(frame)
     runs = frame["netelement_id"].rle().struct
     names = tuple(runs.field("value").to_list())
     first = np.append(0, np.cumsum(ints(runs.field("len"))))
     columns = {name: floats(frame, name) for name in _NUMBERS}
-    columns["height_m"] = _all_or_none(columns["height_m"], first)
+    columns["height_m"] = _complete_heights_m(columns["height_m"], first)
     length_m = columns["measure_m"][first[1:] - 1] - columns["measure_m"][first[:-1]]
     index = {name: number for number, name in enumerate(names)}
     return SurveyedTrack(ids=names, index=index, first=first, length_m=length_m, **columns)
 
 
-def by_element(frame: pl.DataFrame) -> pl.DataFrame:
+def sort_by_element(frame: pl.DataFrame) -> pl.DataFrame:
     """Points element by element, in the order in which elements come up first."""
     name = frame["netelement_id"]
     if (runs := name.rle().struct.field("value")).n_unique() == len(runs):
@@ -156,7 +153,7 @@ def by_element(frame: pl.DataFrame) -> pl.DataFrame:
 
 
 @frozen
-class Along:
+class TrackPlaces:
     """Places along all elements, in order: element number and measure [m] of each, degrees."""
 
     element: Ints
@@ -165,7 +162,7 @@ class Along:
     longitude_deg: Floats
 
 
-def places_along(track: SurveyedTrack, spacing_m: float) -> Along:
+def places_along(track: SurveyedTrack, spacing_m: float) -> TrackPlaces:
     """Places about so far apart on every element, its two ends among them."""
     columns: list[list[Floats]] = [[], [], [], []]
     for number, _, part in track.elements():
@@ -176,14 +173,14 @@ def places_along(track: SurveyedTrack, spacing_m: float) -> Along:
         for column, values in zip(columns, (np.full(len(at_m), float(number)), at_m, *degrees), strict=True):
             column.append(values)
     element, *others = (np.concatenate(column) for column in columns)
-    return Along(element.astype(np.int64), *others)
+    return TrackPlaces(element.astype(np.int64), *others)
 
 
 def geometric_measures_m(latitude_deg: Floats, longitude_deg: Floats, height_m: Floats) -> Floats:
     """Distance from the first point along one element [m]: 3-D where every height is known."""
     flat = np.zeros_like(latitude_deg)
     heights = flat if np.isnan(height_m).any() else height_m
-    return np.concatenate([[0.0], np.cumsum(distances_m(latitude_deg, longitude_deg, heights))])
+    return np.concatenate([[0.0], np.cumsum(point_distances_m(latitude_deg, longitude_deg, heights))])
 
 
 def end_places(track: SurveyedTrack) -> Floats:
@@ -192,7 +189,7 @@ def end_places(track: SurveyedTrack) -> Floats:
     return track.surface[vertices].reshape(-1, 2, 3)
 
 
-def gaps_m(left: Floats, entered: Floats) -> Floats:
+def gap_lengths_m(left: Floats, entered: Floats) -> Floats:
     """Lengths of gaps between ends that count as track [m]: 0 where it is only survey noise."""
     gap = np.linalg.norm(left - entered, axis=-1)
     return np.where(gap > GAP_COUNTS_M, gap, 0.0)
@@ -201,7 +198,7 @@ def gaps_m(left: Floats, entered: Floats) -> Floats:
 _NUMBERS = ("latitude_deg", "longitude_deg", "height_m", "measure_m", "sigma_m")
 
 
-def _all_or_none(height_m: Floats, first: Ints) -> Floats:
+def _complete_heights_m(height_m: Floats, first: Ints) -> Floats:
     """Heights of an element only where all of its points have one: half a profile is no profile."""
     unknown = np.add.reduceat(np.isnan(height_m).astype(np.int64), first[:-1]) > 0
     return np.where(np.repeat(unknown, np.diff(first)), np.nan, height_m)
@@ -209,7 +206,7 @@ def _all_or_none(height_m: Floats, first: Ints) -> Floats:
 
 def in_pieces(track: SurveyedTrack) -> SurveyedTrack:
     """The track with its elements in pieces, each of its element's name and measures, in order."""
-    if not any(_cuts(track)):
+    if not any(_cut_vertices(track)):
         return track
     return track_in_parts(track, [(element, part) for element, parts in enumerate(pieces_of(track)) for part in parts])
 
@@ -220,14 +217,14 @@ def pieces_of(track: SurveyedTrack) -> list[list[slice]]:
     A piece ends where it has turned by more than a right angle since its start.
     """
     pieces = []
-    for element, inside in enumerate(_cuts(track)):
-        whole = track.vertices(element)
+    for element, inside in enumerate(_cut_vertices(track)):
+        whole = track.vertex_range(element)
         ends = [whole.start, *inside, whole.stop - 1]
         pieces.append([slice(begin, end + 1) for begin, end in itertools.pairwise(ends)])
     return pieces
 
 
-def _cuts(track: SurveyedTrack) -> list[list[int]]:
+def _cut_vertices(track: SurveyedTrack) -> list[list[int]]:
     """Vertices between the pieces of each element, each of which turns by less than a right angle in all."""
     owner, vertex = _spaced_vertices(track)
     along = np.diff(track.surface[vertex], axis=0)

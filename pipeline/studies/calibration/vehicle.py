@@ -38,7 +38,7 @@ def estimate_run(t_s: Floats, path_m: Floats, odometry: Odometry) -> RunEstimate
         Scale and latency; None where too little can be compared.
     """
     begin, end = spans_of_rows(t_s)
-    found = scale_and_lag(t_s[begin], t_s[end], path_m[end] - path_m[begin], SignedOdometer(odometry).rows)
+    found = scale_and_lag(t_s[begin], t_s[end], path_m[end] - path_m[begin], SignedOdometer(odometry).counter_rows)
     if not np.isfinite(found.scale_sigma):
         return None
     return RunEstimate(

@@ -101,7 +101,7 @@ def laid_on(spans: pl.DataFrame, stretches: pl.DataFrame, pieces: Pieces) -> pl.
         if element is None:
             continue
         at = _measures(spans, sign, offset_m)
-        rows = pieces.track.vertices(element)
+        rows = pieces.track.vertex_range(element)
         first_m = pieces.track.measure_m[rows][0]
         last_m = pieces.track.measure_m[rows][-1]
         on_element = pl.col("state").is_in(_ANYWHERE) | pl.col("elements").list.contains(name)

@@ -12,7 +12,7 @@ import numpy as np
 import polars as pl
 
 from pipeline.stages.track.geodesy import SEMI_MAJOR_AXIS_M, Points, points_of
-from pipeline.stages.track.network import surveyed
+from pipeline.stages.track.network import surveyed_track
 from pipeline.studies.plausibility.check import KNOWN, Cause, Check, FitState, correction, fits, misfit, not_checked
 from pipeline.studies.plausibility.clocks import StreamLag
 from pipeline.studies.plausibility.odometer import odometer_checks, velocity_checks
@@ -229,12 +229,12 @@ def read_stamp_checks(of: Recording, reads: pl.DataFrame) -> list[Check]:
 
 def _balise_places(site: Site) -> pl.DataFrame:
     """Latitude and longitude of the balises on their net elements [deg]."""
-    track = surveyed(site)
+    track = surveyed_track(site)
     places: list[tuple[str, float, float]] = []
     rows = () if site.balises is None else site.balises.select("balise_id", "netelement_id", "measure_m").iter_rows()
     for name, element, measure_m in rows:
         if (number := track.element_at(element, measure_m)) is not None:
-            part = track.vertices(number)
+            part = track.vertex_range(number)
             degrees = (track.latitude_deg[part], track.longitude_deg[part])
             latitude, longitude = (float(np.interp(measure_m, track.measure_m[part], axis)) for axis in degrees)
             places.append((name, latitude, longitude))

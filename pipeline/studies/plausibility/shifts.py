@@ -7,8 +7,8 @@ from dataclasses import replace
 import numpy as np
 
 from pipeline.stages.track.geodesy import Points
-from pipeline.stages.track.network import Once, surveyed
-from pipeline.stages.track.segments import Polyline, on_segments
+from pipeline.stages.track.network import Once, surveyed_track
+from pipeline.stages.track.segments import Polyline, project_on_segments
 from pipeline.studies.plausibility.pairs import LEAST, clock_lag, explains, halves_of, regressed, sampled, steady
 from pipeline.studies.plausibility.records import MOVING_MPS, Places
 from schemas.arrays import Floats, Ints
@@ -161,7 +161,7 @@ class SurveyFit:
 @Once
 def line_of(site: Site) -> SurveyLine:
     """The segments of a site's track."""
-    track = surveyed(site)
+    track = surveyed_track(site)
     surface = track.surface
     within = np.any(surface[:-1] != surface[1:], axis=1)
     within[track.first[1:-1] - 1] = False
@@ -187,7 +187,7 @@ def fit_survey(gnss: Places, line: SurveyLine, near_m: float) -> SurveyFit:
         """Direction across the track at these segments, how far it is from each position, and its height."""
         along = np.einsum("ijk,ik->ij", axes, line.end[nearest] - line.start[nearest])
         across = np.column_stack([-along[:, 1], along[:, 0]]) / np.maximum(np.linalg.norm(along, axis=1), 1e-9)[:, None]
-        feet = on_segments(points, line, nearest)
+        feet = project_on_segments(points, line, nearest)
         part = np.clip(feet.fraction, 0.0, 1.0)
         low_m = line.height_start_m[nearest]
         return across, -feet.offset_m, low_m + part * (line.height_end_m[nearest] - low_m)

@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from pipeline.stages.track.geodesy import distance_m, distances_m, earth_centred_m, points_of
+from pipeline.stages.track.geodesy import distance_between_m, earth_centred_m, point_distances_m, points_of
 
 GEOD = pyproj.Geod(ellps="WGS84")
 
@@ -18,19 +18,19 @@ GEOD = pyproj.Geod(ellps="WGS84")
 def test_a_line_of_100_km_is_long_as_the_geodesic_to_1e_minus_5(latitude: float, azimuth: float) -> None:
     ends = GEOD.fwd(4.0, latitude, azimuth, 100_000.0)[:2]
     longitude, latitudes = np.array(GEOD.npts(4.0, latitude, *ends, 20_000 - 1, initial_idx=0, terminus_idx=0)).T
-    length = distances_m(latitudes, longitude, np.zeros(len(longitude))).sum()
+    length = point_distances_m(latitudes, longitude, np.zeros(len(longitude))).sum()
     assert length == pytest.approx(100_000.0, rel=1e-8)
 
 
 def test_a_grade_lengthens_the_line() -> None:
-    run = distance_m(50.0, 4.0, 50.0, 4.001)
-    slope = distances_m(np.array([50.0, 50.0]), np.array([4.0, 4.001]), np.array([0.0, 0.03 * run]))[0]
+    run = distance_between_m(50.0, 4.0, 50.0, 4.001)
+    slope = point_distances_m(np.array([50.0, 50.0]), np.array([4.0, 4.001]), np.array([0.0, 0.03 * run]))[0]
     assert slope == pytest.approx(run * np.hypot(1.0, 0.03), rel=1e-6)
 
 
 def test_height_lengthens_the_line() -> None:
-    at_sea = distances_m(np.array([50.0, 50.0]), np.array([4.0, 4.001]), np.zeros(2))[0]
-    high = distances_m(np.array([50.0, 50.0]), np.array([4.0, 4.001]), np.full(2, 1000.0))[0]
+    at_sea = point_distances_m(np.array([50.0, 50.0]), np.array([4.0, 4.001]), np.zeros(2))[0]
+    high = point_distances_m(np.array([50.0, 50.0]), np.array([4.0, 4.001]), np.full(2, 1000.0))[0]
     assert high / at_sea - 1.0 == pytest.approx(1000.0 / 6.39e6, rel=1e-3)
 
 

@@ -8,7 +8,7 @@ import pytest
 
 from pipeline.results.places import ground_at, ground_of, offset_positions, plane_m, stretches_of
 from pipeline.show.export.positions import positions_of
-from pipeline.stages.track.geodesy import distance_m
+from pipeline.stages.track.geodesy import distance_between_m
 from tests.show.export.conftest import Result
 
 # One degree of longitude on the equator is 111 319.49 m: 6 378 137 m · π / 180.
@@ -75,7 +75,7 @@ def test_truth_is_the_reference_of_the_log(result: Result) -> None:
     both = truth.join(result.log.reference, on="t", suffix="_log")
     assert both.height > 1000
     pairs = both.select("latitude_deg", "longitude_deg", "latitude_deg_log", "longitude_deg_log").iter_rows()
-    away = np.array([distance_m(*pair) for pair in pairs])
+    away = np.array([distance_between_m(*pair) for pair in pairs])
     moving_delay_m = 0.05 * 41.0
     assert away.max() < 2.5 + moving_delay_m + 1.0
 
@@ -92,7 +92,7 @@ def test_matched_less_truth_is_the_error(result: Result) -> None:
     both = places.matched.join(places.truth, on="t", suffix="_true").join(epochs.select("t", "error_along_m"), on="t")
     east, north = (both[name].to_numpy() for name in ("longitude_deg", "latitude_deg"))
     pairs = zip(north, east, both["latitude_deg_true"], both["longitude_deg_true"], strict=True)
-    away = np.array([distance_m(*pair) for pair in pairs])
+    away = np.array([distance_between_m(*pair) for pair in pairs])
     error = both["error_along_m"].abs().to_numpy()
     near = error < 10.0
     np.testing.assert_allclose(away[near], error[near], atol=0.01)

@@ -7,10 +7,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from pipeline.stages.evidence.anchors import Sided, reference_movements, sided
-from pipeline.stages.evidence.carrying import Lags, RecorderClock, SignedOdometer, TrueAnchor, lags_of
+from pipeline.stages.evidence.anchors import OrientedStretch, orient_stretch, reference_movements
+from pipeline.stages.evidence.carrying import Lags, RecorderClock, SignedOdometer, TrueAnchor, measure_lags
 from pipeline.stages.evidence.contradictions import Witness
-from pipeline.stages.evidence.gathering import known_stretch
+from pipeline.stages.evidence.gathering import stretch_as_evidence
 from pipeline.stages.odometry import odometry_of
 from pipeline.stages.reference import ReferencePath, ReferenceStretch
 from pipeline.stages.track.path import Place, RoutePath
@@ -36,7 +36,7 @@ def stretch(t_s: Floats, at_m: Floats, forward: bool = True) -> ReferenceStretch
 
 def against(*counters: SignedOdometer) -> tuple[Witness, ...]:
     """These odometers on the reference's clock, their scale within 5 %."""
-    return tuple(Witness.of(counter, Lags(), CONFIG) for counter in counters)
+    return tuple(Witness.with_measured_scale(counter, Lags(), CONFIG) for counter in counters)
 
 
 def counter(at_m: Floats, rate_hz: float) -> SignedOdometer:
@@ -51,9 +51,9 @@ def test_a_stretch_faces_along_its_element_as_the_odometer_counts_up(forward: bo
     """Oriented elements are twice their number in the sense of the measure, and one more against it."""
     t_s = np.arange(0.0, 61.0)
     at_m = 10.0 * t_s if away else 600.0 - 10.0 * t_s
-    side = sided(stretch(t_s, at_m, forward), counter(10.0 * t_s, 1.0), 50.0)
+    side = orient_stretch(stretch(t_s, at_m, forward), counter(10.0 * t_s, 1.0), 50.0)
     assert side.sense == (1 if away else -1)
-    assert side.first_oriented == (8 if forward is away else 9)
+    assert side.first_oriented_element == (8 if forward is away else 9)
     assert (side.with_m, side.against_m) == pytest.approx((600.0, 0.0))
 
 
@@ -62,7 +62,7 @@ def test_a_shunt_before_the_journey_does_not_turn_the_sense() -> None:
     t_s = np.arange(0.0, 50.0)
     at_m = np.interp(t_s, [0, 4, 19, 49], [100, 80, 80, 380])
     counted_m = np.interp(t_s, [0, 4, 19, 49], [0, 20, 20, 320])
-    side = sided(stretch(t_s, at_m), counter(counted_m, 1.0), 50.0)
+    side = orient_stretch(stretch(t_s, at_m), counter(counted_m, 1.0), 50.0)
     # But for what is left within the noise of 6 m.
     assert (side.sense, side.with_m, side.against_m) == (1, pytest.approx(294.0, abs=6.0), pytest.approx(14.0, abs=6.0))
 
@@ -78,12 +78,12 @@ def test_seventy_seconds_of_changing_speed_tell_a_lag() -> None:
     t_s = np.arange(0.0, 71.0, 0.1)
     late = stretch(t_s + 0.4, np.interp(t_s, fine_s, way_m))
     counted = counter(np.interp(np.arange(0.0, 72.0, 0.1), fine_s, way_m), 10.0)
-    (found,) = lags_of(*reference_movements([Sided(late, 1, 1.0, 0.0)], no_gaps), counted, CONFIG).found
+    (found,) = measure_lags(*reference_movements([OrientedStretch(late, 1, 1.0, 0.0)], no_gaps), counted, CONFIG).found
     assert found.lag_s == pytest.approx(0.4, abs=0.03)
     assert found.lag_sigma_s < 0.05
     cut = late.t_ns <= 60 * NS_PER_S
-    few = ReferenceStretch(late.t_ns[cut], late.sigma_m[cut], (late.paths[0].part(slice(int(cut.sum()))),))
-    (unsure,) = lags_of(*reference_movements([Sided(few, 1, 1.0, 0.0)], no_gaps), counted, CONFIG).found
+    few = ReferenceStretch(late.t_ns[cut], late.sigma_m[cut], (late.paths[0].some_rows(slice(int(cut.sum()))),))
+    (unsure,) = measure_lags(*reference_movements([OrientedStretch(few, 1, 1.0, 0.0)], no_gaps), counted, CONFIG).found
     assert not unsure.measured
 
 
@@ -91,7 +91,9 @@ def test_a_clock_counts_by_the_greatest_speed_that_it_leaves_possible() -> None:
     """t^2 metres: 2 t m/s at each sample over a second about it, 2 (t + 0.5) half a second later."""
     t_s = np.arange(0.0, 10.25, 0.25)
     clock = replace(SURE, shift_s=3.0, delta_s=0.5)
-    found = known_stretch(Sided(stretch(t_s + 3.0, t_s**2), 1, 1.0, 0.0), clock, against(), [], 0.0, CONFIG)
+    found = stretch_as_evidence(
+        OrientedStretch(stretch(t_s + 3.0, t_s**2), 1, 1.0, 0.0), clock, against(), [], 0.0, CONFIG
+    )
     assert found.t_ns.tolist() == ns(t_s).tolist()
     assert found.clock_m[4:36] == pytest.approx(0.5 * 2.0 * (t_s[4:36] + 0.5))
     assert found.clock_m[0] == pytest.approx(0.5 * 1.0)  # at 0.5 s; before the first sample nothing moved faster
@@ -115,8 +117,8 @@ def test_a_step_leaves_both_sides_open_where_no_read_confirms(
     step_m = np.where(t_s >= 9.0, 30.0, 0.0)
     ahead = step_m[-1] if read_s > 9.0 else 0.0
     read = TrueAnchor(round(read_s * NS_PER_S), (Place(4, read_m + ahead),), 1.0, Evidence.BALISE)
-    side = Sided(stretch(t_s, 10.0 * t_s + step_m), 1, 1.0, 0.0)
-    found = known_stretch(side, SURE, against(counted), [read], 0.0, CONFIG)
+    side = OrientedStretch(stretch(t_s, 10.0 * t_s + step_m), 1, 1.0, 0.0)
+    found = stretch_as_evidence(side, SURE, against(counted), [read], 0.0, CONFIG)
     (path,) = found.paths
     assert np.flatnonzero(path.step_m).tolist() == [17]
     assert (path.at_m - path.low_m).tolist() == pytest.approx([0.0] * 18 + [behind_m] * 23)
@@ -131,7 +133,12 @@ def test_a_drift_is_seen_wherever_long_windows_begin(begun_s: float) -> None:
     sigma_m = np.full(t_s.size, 0.4)
     seen = replace(stretch(t_s, 20.0 * t_s + drift_m), sigma_m=sigma_m)
     witness = Witness(counter(20.0 * np.arange(0.0, 261.0, 0.5), 2.0))
-    found = known_stretch(Sided(seen, 1, 1.0, 0.0), SURE, (witness,), [], 0.0, CONFIG)
-    assert found.levels.doubts == 1
+    found = stretch_as_evidence(OrientedStretch(seen, 1, 1.0, 0.0), SURE, (witness,), [], 0.0, CONFIG)
+    assert found.levels.count_doubted_steps == 1
     honest = replace(stretch(t_s, 20.0 * t_s), sigma_m=sigma_m)
-    assert known_stretch(Sided(honest, 1, 1.0, 0.0), SURE, (witness,), [], 0.0, CONFIG).levels.doubts == 0
+    assert (
+        stretch_as_evidence(
+            OrientedStretch(honest, 1, 1.0, 0.0), SURE, (witness,), [], 0.0, CONFIG
+        ).levels.count_doubted_steps
+        == 0
+    )

@@ -7,7 +7,7 @@ import polars as pl
 import pytest
 
 from pipeline.stages.evidence.anchors import read_anchors
-from pipeline.stages.evidence.gaps import chains_between, extended
+from pipeline.stages.evidence.gaps import chains_between, extend_chain
 from pipeline.stages.track.network import Network, network_of
 from pipeline.stages.track.path import Chain, Place, RoutePath
 from pipeline.stages.track.survey import track_of
@@ -56,9 +56,9 @@ def test_a_chain_of_another_length_is_none_and_too_many_are_not_weighed() -> Non
 def test_a_chain_goes_on_over_what_trains_may_run_in_either_sense() -> None:
     """From 20 m into b, 30 m back and 90 m ahead; the entry of b is 0."""
     network = line("BA")
-    (found,) = extended(network, Chain((2,), (0.0,)), -30.0, 110.0, 64) or []
+    (found,) = extend_chain(network, Chain((2,), (0.0,)), -30.0, 110.0, 64) or []
     assert (names([found]), found.entry_m) == (["abc"], (-100.0, 0.0, 100.0))
-    route = found.route(network)
+    route = found.as_route(network)
     element, measure_m, sense = route.locate(np.array([-30.0, 20.0, 110.0]))
     assert (element.tolist(), sense.tolist()) == ([0, 1, 2], [1, 1, 1])
     assert measure_m == pytest.approx([70.0, 20.0, 10.0], abs=1e-6)
@@ -70,7 +70,7 @@ def test_of_two_visits_the_one_that_holds_the_measure_counts_else_the_nearer() -
         element=np.array([0, 0]), forward=np.array([True, True]), entry_m=np.array([0.0, 500.0]),
         low_m=np.array([0.0, 50.0]), high_m=np.array([50.0, 100.0]),
     )  # fmt: skip
-    at_m, sense = route.coordinate(
+    at_m, sense = route.coordinates_of(
         np.zeros(4, np.int64), np.array([60.0, 45.0, 50.0, 50.0]), np.array([0.0, 490.0, 20.0, 480.0])
     )
     assert at_m.tolist() == [510.0, 45.0, 50.0, 500.0]

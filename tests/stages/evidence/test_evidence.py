@@ -8,8 +8,8 @@ import pytest
 
 from pipeline.stages.evidence import evidence_of
 from pipeline.stages.evidence.anchors import read_anchors
-from pipeline.stages.evidence.carrying import SignedOdometer, TrueAnchor, carried_forward
-from pipeline.stages.evidence.evidence import KINDS, _after_standing
+from pipeline.stages.evidence.carrying import SignedOdometer, TrueAnchor, carry_from_accepted
+from pipeline.stages.evidence.evidence import KINDS, _are_beyond_stand
 from pipeline.stages.evidence.gaps import Gap, GapSearch
 from pipeline.stages.odometry import Odometry, odometry_of
 from pipeline.stages.track.path import Place
@@ -42,7 +42,7 @@ def test_gaps_are_before_between_and_after_what_is_known() -> None:
     """The odometer counts from 0 to 10 s; the reference tells from 2 to 5 s and from 7 to 9 s."""
     a, b, c, d = (anchor(t_s, 10.0 * t_s) for t_s in (2, 5, 7, 9))
     counter = SignedOdometer(counting(np.arange(0.0, 110.0, 10.0)))
-    found = GapSearch(counter, line("both"), Configuration()).gaps_of([(a, b), (c, d)])
+    found = GapSearch(counter, line("both"), Configuration()).find_gaps([(a, b), (c, d)])
     assert [(gap.begin_ns, gap.end_ns) for gap in found] == [
         tuple(seconds(*ends)) for ends in ((0, 2), (5, 7), (9, 10))
     ]
@@ -55,7 +55,7 @@ def test_where_the_odometer_slipped_a_longer_way_is_one_too(counted_mps: float, 
     config = Configuration(hazards=HazardConfig(slip_m=0.0, slip_share=share))
     a, b = anchor(2, 20.0), anchor(8, 80.0)
     counter = SignedOdometer(counting(np.arange(11) * counted_mps))
-    _, between, _ = GapSearch(counter, line("both"), config).gaps_of([(a, a), (b, b)])
+    _, between, _ = GapSearch(counter, line("both"), config).find_gaps([(a, a), (b, b)])
     assert bool(between.routes) is known
 
 
@@ -100,8 +100,8 @@ def test_nothing_is_carried_over_a_stand_of_the_odometer(
     """From 2 s on, and back from 8 s: what lies beyond the stand, as seen from the anchor, is void."""
     at_ns, stood = seconds(3, 5, 7, 8), [(stood_s[0] * NS_PER_S, stood_s[1] * NS_PER_S)]
     begin, end = 2 * NS_PER_S, 8 * NS_PER_S
-    from_begin = _after_standing(at_ns, Gap(begin, end, anchor(2, 0.0), None, []), stood)
-    from_end = _after_standing(at_ns, Gap(begin, end, None, anchor(8, 0.0), []), stood)
+    from_begin = _are_beyond_stand(at_ns, Gap(begin, end, anchor(2, 0.0), None, []), stood)
+    from_end = _are_beyond_stand(at_ns, Gap(begin, end, None, anchor(8, 0.0), []), stood)
     assert (from_begin.tolist(), from_end.tolist()) == (ahead, behind)
 
 
@@ -111,7 +111,7 @@ def test_since_an_accepted_balise_nothing_is_carried_over_a_stand() -> None:
     stood = [(3 * NS_PER_S, 4 * NS_PER_S)]
     at_ns = seconds(0, 2, 3, 5, 8)
     counted = counting(np.arange(0.0, 110.0, 10.0))
-    low_m, high_m = carried_forward(accepted_ns, path_m, at_ns, counted, stood, Configuration())
+    low_m, high_m = carry_from_accepted(accepted_ns, path_m, at_ns, counted, stood, Configuration())
     assert low_m == pytest.approx([np.nan, 14.5, np.nan, np.nan, 74.0], nan_ok=True)
     assert high_m == pytest.approx([np.nan, 25.5, np.nan, np.nan, 86.0], nan_ok=True)
 
@@ -120,7 +120,7 @@ def test_an_accepted_balise_that_the_odometer_contradicts_carries_nothing() -> N
     """10 m/s; those of 3 s and 4 s lie 40 m ahead, that of 5 s where it should; 5 m and 5 % of the way."""
     accepted_ns, path_m = seconds(1, 2, 3, 4, 5, 20), np.array([10.0, 20.0, 70.0, 80.0, 50.0, 200.0])
     counted = counting(np.arange(0.0, 110.0, 10.0))
-    low_m, high_m = carried_forward(accepted_ns, path_m, seconds(2, 4, 5, 7), counted, [], Configuration())
+    low_m, high_m = carry_from_accepted(accepted_ns, path_m, seconds(2, 4, 5, 7), counted, [], Configuration())
     assert low_m == pytest.approx([15.0, 34.0, 45.0, 64.0])
     assert high_m == pytest.approx([25.0, 46.0, 55.0, 76.0])
 
@@ -128,6 +128,6 @@ def test_an_accepted_balise_that_the_odometer_contradicts_carries_nothing() -> N
 def test_without_an_accepted_balise_nothing_is_carried() -> None:
     counted = counting(np.arange(0.0, 110.0, 10.0))
     nothing = np.zeros(0, dtype=np.int64), np.zeros(0)
-    low_m, high_m = carried_forward(*nothing, seconds(2, 4), counted, [], Configuration())
+    low_m, high_m = carry_from_accepted(*nothing, seconds(2, 4), counted, [], Configuration())
     assert np.isnan(low_m).all()
     assert np.isnan(high_m).all()

@@ -9,7 +9,7 @@ import polars as pl
 import pytest
 
 from pipeline.stages.evidence.evidence import KINDS, NOTHING
-from pipeline.stages.evidence.gathering import on_time, without_frozen
+from pipeline.stages.evidence.gathering import without_frozen, without_latency
 from pipeline.stages.odometry import odometry_of
 from schemas.config import Configuration, HazardConfig, Vehicle
 from schemas.enums import Evidence as Kind
@@ -43,11 +43,11 @@ def of_origin(stream: pl.DataFrame, origin: Origin) -> pl.DataFrame:
 def test_a_declared_lag_is_taken_off_the_stamps() -> None:
     rng = np.random.default_rng(1)
     late = reference(wavy(30.0), rng, late_s=0.5)
-    taken = on_time(late, 0.5)
+    taken = without_latency(late, 0.5)
     assert taken is not None
     assert ((late["t"] - taken["t"]).dt.total_milliseconds() == 500).all()
-    assert on_time(late, 0.0) is late
-    assert on_time(None, 0.5) is None
+    assert without_latency(late, 0.0) is late
+    assert without_latency(None, 0.5) is None
 
 
 @pytest.mark.parametrize("origin", [Origin.WHEEL, Origin.UNKNOWN])

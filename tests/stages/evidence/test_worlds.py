@@ -288,7 +288,7 @@ def test_a_read_says_which_side_of_a_step_is_right() -> None:
     low, high, holds = bounds(evidence, ride.at(at_s))
     assert holds.all()
     assert np.median((high - low)[at_s > 120.0]) < 25.0
-    assert found.disputed == 0
+    assert found.count_disputed_reads == 0
 
 
 def test_an_odometer_that_stands_contradicts_the_reference_which_says_nothing_then() -> None:
@@ -378,7 +378,7 @@ def test_less_evidence_leaves_no_less() -> None:
     counted, truth, read = odometer(ride, rng), reference(ride, rng, sigma_m=1.0), reads(ride, GROUND, rng)
     at_s = np.arange(15.0, 380.0, 0.7)
     full = known(GROUND, counted, of_reference=truth, of_reads=read)
-    assert full.disputed == 0
+    assert full.count_disputed_reads == 0
     low, high, holds = bounds(full.at(ns(at_s)), ride.at(at_s))
     assert holds.all()
     for less in ({"of_reference": truth}, {"of_reads": read}):

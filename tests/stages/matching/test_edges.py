@@ -33,7 +33,7 @@ def test_elements_without_any_relation() -> None:
     place = site({"a": line((0, 0), (1000, 0)), "b": line((0, 20), (1000, 20)), "c": line((0, 500), (1000, 500))})
     x = np.arange(100.0, 900.0, 10.0)
     found = matched(run(x, np.full(80, 19.0)), place, odometer(x))
-    assert found.path.elements() == ["b"]
+    assert found.path.element_names() == ["b"]
     assert found.ambiguous.is_empty()
 
 
@@ -45,7 +45,7 @@ def test_an_odometer_of_speeds_and_one_that_ends_early() -> None:
     short = whole[:30]
     for distance in (speeds, short, whole[:1]):
         found = matched(fixes, PLACES["network"], distance)
-        assert found.path.elements() == ["s", "m"]
+        assert found.path.element_names() == ["s", "m"]
         assert np.allclose(found.epochs.table["path_m"], x, atol=1e-2)
 
 
@@ -115,7 +115,7 @@ def test_exact_positions_give_the_exact_way(seed: int, backwards: bool, with_odo
         x, y, way = x[::-1], y[::-1], way[::-1]
     fixes = run(x, y, sigma_m=0.3)
     found = matched(fixes, site(elements, links), odometer(0.995 * distance) if with_odometer else None)
-    assert found.path.elements() == way
+    assert found.path.element_names() == way
     assert np.allclose(np.diff(found.epochs.table["path_m"]), 4.0, atol=0.02)
     assert np.abs(found.epochs.table["cross_track_m"]).max() < 0.01
 

@@ -31,7 +31,7 @@ def test_a_jump_past_the_end_of_a_track_does_not_decide() -> None:
     y = np.zeros(len(x))
     y[-1] = 10.0
     found = matched(run(x, y, sigma_m=0.1), place)
-    assert found.path.elements()[0] == "a"
+    assert found.path.element_names()[0] == "a"
     assert found.epochs.table["path_probability"][50] >= 0.99
 
 
@@ -42,7 +42,7 @@ def test_a_standing_train_does_not_jump_to_another_track(rate_hz: float) -> None
     y = np.zeros(count)
     y[count // 4 : count // 4 + int(2 * rate_hz)] = 220.0
     found = matched(run(np.full(count, 500.0), y, rate_hz, sigma_m=0.1), TRACKS)
-    assert found.path.elements() == ["a"]
+    assert found.path.element_names() == ["a"]
     away = y > 0
     gate = found.epochs.table["gate_probability"].fill_null(0.0).to_numpy()
     assert (gate[away & np.roll(away, round(rate_hz))] < 0.99).all()
@@ -97,7 +97,7 @@ def test_a_stretch_of_positions_on_another_track_does_not_move_the_run(track_y: 
     y = np.full(len(x), track_y)
     y[150:250] = 215.0
     found = matched(run(x, y, 2.5, sigma_m=0.1), TRACKS)
-    assert found.path.elements() == (["a", "b"] if track_y == 0.0 else ["c", "d"])
+    assert found.path.element_names() == (["a", "b"] if track_y == 0.0 else ["c", "d"])
     before_and_after = np.r_[20:140, 360:400]
     assert found.epochs.table["gate_probability"].fill_null(0.0).to_numpy()[before_and_after].min() >= 0.99
     assert not found.epochs.table["on_track"][150:250].any()
@@ -108,7 +108,7 @@ def test_a_track_far_beside_is_paid_for_by_the_time_on_it() -> None:
     x = np.arange(20.0, 1980.0, 4.9)
     y = np.where(np.arange(len(x)) < 25, 20.0, 0.0)
     found = matched(run(x, y, 2.5, sigma_m=0.1), TRACKS)
-    assert found.path.elements() == ["a", "b"]
+    assert found.path.element_names() == ["a", "b"]
     assert found.epochs.table["path_probability"][200] >= 0.99
 
 
@@ -126,7 +126,7 @@ def test_how_a_lost_position_moves_does_not_choose_between_parallel_tracks(seed:
     y = 0.05 * rng.normal(size=len(x))
     y[150:300] += 100.0 + bend(x[150:300])
     found = matched(run(x, y, 2.5, sigma_m=None, fix=["rtk_fixed"] * len(x)), place)
-    assert found.path.elements() == ["a"]
+    assert found.path.element_names() == ["a"]
     assert found.epochs.table["gate_probability"].to_numpy()[-8:].min() > 0.5
 
 

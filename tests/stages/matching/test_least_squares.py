@@ -24,7 +24,7 @@ def test_over_an_outage_the_odometer_tells_which_way_was_taken(name: str) -> Non
     seen = (x < 480.0) | (x > 1520.0)
     fixes = run(x, y, fix=np.where(seen, "sbas", "none"))
     found = matched(fixes, site(WAYS, LINKS), odometer(at))
-    assert found.path.elements() == ["in", name, "out"]
+    assert found.path.element_names() == ["in", name, "out"]
     known = found.epochs.table["path_m"].is_not_null().to_numpy()
     assert np.allclose(found.epochs.table["path_m"].to_numpy()[known], at[known], atol=2.0)
 
@@ -35,7 +35,7 @@ def test_of_two_tracks_that_no_position_tells_apart_the_nearer_is_shown_and_not_
     place = site({"a": line((0, 0), (2000, 0)), "b": line((0, 4), (2000, 4))})
     x = np.arange(20.0, 1980.0, 10.0)
     found = matched(run(x, np.full(len(x), y_m)), place, odometer(x))
-    assert found.path.elements() == [name]
+    assert found.path.element_names() == [name]
     assert found.epochs.table["path_probability"].max() < 0.99
 
 
@@ -45,7 +45,7 @@ def test_a_coarse_survey_does_not_win_by_being_coarse() -> None:
     tracks = good.track.with_columns(sigma_m=np.where(good.track["netelement_id"] == "b", 2.0, 0.1))
     x = np.arange(20.0, 1980.0, 10.0)
     found = matched(run(x, np.full(len(x), 1.5)), type(good)(tracks, good.links), odometer(x))
-    assert found.path.elements() == ["a"]
+    assert found.path.element_names() == ["a"]
 
 
 def test_what_the_whole_run_refutes_is_not_shown_however_near_it_is() -> None:
@@ -59,7 +59,7 @@ def test_what_the_whole_run_refutes_is_not_shown_however_near_it_is() -> None:
     at = np.arange(50.0, 2400.0, 10.0)
     y = np.where((at > 1130.0) & (at < 1250.0), 1.3, 0.6)
     found = matched(run(at, y, sigma_m=1.0), place, odometer(at))
-    assert found.path.elements() == ["s", "a"]
+    assert found.path.element_names() == ["s", "a"]
     assert not (found.epochs.table["netelement_id"] == "b").any()
 
 
@@ -70,7 +70,7 @@ def test_a_track_to_which_nothing_leads_is_shown_only_if_the_train_stays_there(a
     x = np.arange(20.0, 2900.0, 10.0)
     y = np.where(np.arange(len(x)) >= len(x) - away_s, 20.0, 0.0)
     found = matched(run(x, y, sigma_m=0.5), place, odometer(x))
-    assert found.path.elements() == names
+    assert found.path.element_names() == names
 
 
 def test_off_every_track_the_path_goes_on_over_the_elements_between() -> None:
@@ -80,6 +80,6 @@ def test_off_every_track_the_path_goes_on_over_the_elements_between() -> None:
     x = np.arange(20.0, 2380.0, 20.0)
     y = np.where((x > 700.0) & (x < 1500.0), 30.0, 0.0)
     found = matched(run(x, y, sigma_m=0.5), place, odometer(x))
-    assert found.path.elements() == list("abcdef")
+    assert found.path.element_names() == list("abcdef")
     assert np.allclose(found.epochs.table["path_m"], x, atol=0.1)
     assert np.allclose(found.epochs.table["cross_track_m"], y, atol=0.1)

@@ -38,7 +38,7 @@ def test_either_way_over_a_switch(name: str, with_odometer: bool) -> None:
     found = matched(
         run(x, y + bias), site(SWITCH, SWITCH_LINKS), odometer(-1.005 * distance) if with_odometer else None
     )
-    assert found.path.elements() == ["s", name]
+    assert found.path.element_names() == ["s", name]
     assert found.epochs.table["netelement_id"][-1] == name
     assert np.allclose(found.epochs.table["path_m"], distance, atol=1.5)
     assert (found.epochs.table["path_probability"] >= 0.99).all()
@@ -80,7 +80,7 @@ def test_trailing_through_a_switch_and_back() -> None:
     x, y = along(branch("d"), there)
     travelled = np.concatenate([[0.0], np.cumsum(np.diff(there))])
     found = matched(run(x, y), site(SWITCH, SWITCH_LINKS), odometer(travelled))
-    assert found.path.elements() == ["d", "s"]
+    assert found.path.element_names() == ["d", "s"]
     assert len(found.path.legs) == 1
     assert found.epochs.table["path_m"][70] - found.epochs.table["path_m"][0] == pytest.approx(700.0, abs=1.0)
     assert found.epochs.table["path_m"][-1] == pytest.approx(found.epochs.table["path_m"][1], abs=1.0)
@@ -117,7 +117,7 @@ def test_a_tunnel_is_bridged_and_elements_without_fixes_are_there() -> None:
     fixes = run(x, np.zeros(len(x)), fix=np.where(seen, "sbas", "none"))
     for distance in (odometer(x), None):
         found = matched(fixes, site(elements, links), distance)
-        assert found.path.elements() == list("abcde")
+        assert found.path.element_names() == list("abcde")
         assert found.epochs.table["path_m"].drop_nulls()[-1] == pytest.approx(x[-1], abs=0.1)
 
 
@@ -133,7 +133,7 @@ def test_a_jump_along_the_track_makes_no_detour(jump_m: float, seed: int) -> Non
     raw = x + np.where(inside, jump_m, 0.0)
     y = np.full(epochs, 0.5)
     found = matched(run(raw, y, rate_hz=2.0), ladder(), odometer(x, rate_hz=2.0))
-    assert found.path.elements() == ["A1", "A2"]
+    assert found.path.element_names() == ["A1", "A2"]
     assert len(found.path.legs) == 1
     assert np.allclose(found.epochs.table["path_m"], raw, atol=0.01)
     # Half a metre aside on tracks 4 m apart never proves more; the jump takes nothing off.
@@ -146,7 +146,7 @@ def test_a_jump_onto_the_other_track_for_a_while_is_not_followed() -> None:
     x = 50.0 + 10.0 * np.arange(280.0)
     y = np.where((x > 1500) & (x < 1800), 4.0, 0.0)
     found = matched(run(x, y, rate_hz=2.0), ladder(), odometer(x, rate_hz=2.0))
-    assert found.path.elements() == ["A1", "A2"]
+    assert found.path.element_names() == ["A1", "A2"]
     assert np.allclose(found.epochs.table["cross_track_m"], y, atol=0.01)
 
 
@@ -155,16 +155,16 @@ def test_relations_that_are_not_navigable_lead_nowhere() -> None:
     distance = np.arange(300.0, 1200.0, 10.0)
     x, y = along(branch("d"), distance)
     place = site(SWITCH, [("s", 1, "m", 0, "both"), ("s", 1, "d", 0, "BA")])
-    assert matched(run(x, 0.5 * y), place, odometer(distance)).path.elements() == ["s", "m"]
+    assert matched(run(x, 0.5 * y), place, odometer(distance)).path.element_names() == ["s", "m"]
     closed = site(SWITCH, [("s", 1, "m", 0, "both"), ("s", 1, "d", 0, "none")])
-    assert matched(run(x, 0.5 * y), closed, odometer(distance)).path.elements() == ["s", "m"]
+    assert matched(run(x, 0.5 * y), closed, odometer(distance)).path.element_names() == ["s", "m"]
 
 
 def test_one_way_relations_hold_for_the_way_back_too() -> None:
     distance = np.arange(1200.0, 300.0, -10.0)
     x, y = along(branch("d"), distance)
     place = site(SWITCH, [("s", 1, "m", 0, "AB"), ("s", 1, "d", 0, "BA")])
-    assert matched(run(x, 0.5 * y), place, odometer(distance)).path.elements() == ["d", "s"]
+    assert matched(run(x, 0.5 * y), place, odometer(distance)).path.element_names() == ["d", "s"]
 
 
 def test_a_given_route_overrides_the_positions() -> None:
@@ -173,7 +173,7 @@ def test_a_given_route_overrides_the_positions() -> None:
         ladder().track, ladder().links, route=pl.DataFrame({"netelement_id": ["B1", "B2"], "direction": ["AB", "AB"]})
     )
     found = matched(trip.fixes, given, trip.odometer)
-    assert found.path.elements() == ["B1", "B2"]
+    assert found.path.element_names() == ["B1", "B2"]
     assert found.epochs.table["cross_track_m"].median() == pytest.approx(-4.0, abs=3.0)
     assert (found.epochs.table["path_probability"] == 1.0).all()
 
@@ -183,7 +183,7 @@ def test_a_route_against_the_run_is_turned() -> None:
     distance = np.arange(300.0, 1400.0, 10.0)
     x, y = along(branch("d"), distance)
     found = matched(run(x, y), place, odometer(distance))
-    assert found.path.elements() == ["s", "d"]
+    assert found.path.element_names() == ["s", "d"]
     assert np.allclose(found.epochs.table["path_m"], distance, atol=0.1)
 
 
@@ -202,7 +202,7 @@ def test_balise_reads_pin_the_track() -> None:
     free = matched(run(x, np.full(200, 2.0), rate_hz=2.0), place, odometer(x, rate_hz=2.0))
     pinned = matched(run(x, np.full(200, 2.0), rate_hz=2.0), place, odometer(x, rate_hz=2.0), reads=reads)
     assert free.epochs.table["gate_probability"][60] < 0.9
-    assert pinned.path.elements() == ["B1", "B2"]
+    assert pinned.path.element_names() == ["B1", "B2"]
     assert pinned.epochs.table["gate_probability"][44] < 0.9
     assert pinned.epochs.table["gate_probability"][47:90].min() >= 0.99
 
@@ -237,7 +237,7 @@ def test_a_given_route_may_pass_an_element_twice() -> None:
     distance = np.arange(100.0, 4600.0, 10.0)
     x, y = along(around, distance)
     found = matched(run(x, y), place, odometer(distance))
-    assert found.path.elements() == ["in", "r", "out"]
+    assert found.path.element_names() == ["in", "r", "out"]
     assert found.path.legs[0].end_m == pytest.approx(float(np.hypot(*np.diff(around, axis=0).T).sum()), abs=0.1)
     assert np.allclose(found.epochs.table["path_m"], distance, atol=1.0)
 
@@ -259,7 +259,7 @@ def test_gaps_between_linked_ends_count_as_track() -> None:
     place = site(elements, [("a", 1, "b", 0, "both"), ("a", 1, "c", 0, "both")])
     x = np.arange(100.0, 900.0, 10.0)
     found = matched(run(x, np.zeros(len(x))), place, odometer(x))
-    assert found.path.elements() == ["a", "b"]
+    assert found.path.element_names() == ["a", "b"]
     assert np.allclose(found.epochs.table["path_m"], x, atol=0.1)
 
 
@@ -268,7 +268,7 @@ def test_a_survey_that_goes_on_beside_where_it_ended_has_no_way_in_between() -> 
     place = site(elements, [("a", 1, "b", 0, "both"), ("a", 1, "c", 0, "both")])
     x = np.arange(100.0, 900.0, 10.0)
     found = matched(run(x, np.where(x < 500.0, 0.0, 1.5)), place, odometer(x))
-    assert found.path.elements() == ["a", "b"]
+    assert found.path.element_names() == ["a", "b"]
     assert np.allclose(found.epochs.table["path_m"], x, atol=0.1)
 
 
@@ -278,7 +278,7 @@ def test_standstill_beside_a_switch_adds_nothing() -> None:
     x = np.concatenate([np.arange(500.0, 1003.0, 5.0), np.full(600, 1003.0), np.arange(1003.0, 1500.0, 5.0)])
     noise = 0.5 * rng.normal(size=(len(x), 2))
     found = matched(run(x + noise[:, 0], noise[:, 1]), site(SWITCH, SWITCH_LINKS), odometer(x))
-    assert found.path.elements() == ["s", "m"]
+    assert found.path.element_names() == ["s", "m"]
     assert len(found.path.legs) == 1
     assert np.allclose(found.epochs.table["path_m"], x, atol=3.0)
 
@@ -290,7 +290,7 @@ def test_off_the_network_for_a_while() -> None:
     away = (x > 600) & (x < 900)
     assert found.epochs.table["on_track"].to_list() == (~away).tolist()
     assert found.epochs.table["gate_probability"].is_null().to_list() == away.tolist()
-    assert found.path.elements() == ["s", "m"]
+    assert found.path.element_names() == ["s", "m"]
     with pytest.raises(InputError, match="off the track"):
         matched(run(x, np.full(len(x), 400.0)), site(SWITCH, SWITCH_LINKS))
 
@@ -309,7 +309,7 @@ def test_reversed_runs_take_the_same_elements() -> None:
         back_fixes = trip.fixes.reverse().with_columns(t=trip.fixes["t"])
         distance = trip.odometer.reverse().with_columns(t=trip.odometer["t"])
         back = matched(back_fixes, ladder(), distance)
-        assert back.path.elements() == there.path.elements()[::-1]
+        assert back.path.element_names() == there.path.element_names()[::-1]
         length = there.path.legs[-1].end_m
         assert np.allclose(back.epochs.table["path_m"].reverse(), length - there.epochs.table["path_m"], atol=1e-6)
         assert np.allclose(

@@ -42,7 +42,7 @@ def test_hand_worked_places_on_a_line_to_the_east() -> None:
 def test_a_run_to_the_west_grows_to_the_west_and_left_is_south() -> None:
     x = np.array([900.0, 850.0, 800.0])
     found = matched(run(x, np.array([1.0, 1.0, 1.0])), site(TWO, TWO_LINKS))
-    assert found.path.elements() == ["b"]
+    assert found.path.element_names() == ["b"]
     assert np.allclose(found.epochs.table["path_m"], [100.0, 150.0, 200.0], atol=2e-3)
     assert np.allclose(found.epochs.table["measure_m"], [100.0, 150.0, 200.0], atol=2e-3)
     assert np.allclose(found.epochs.table["cross_track_m"], -1.0, atol=1e-4)
@@ -51,7 +51,7 @@ def test_a_run_to_the_west_grows_to_the_west_and_left_is_south() -> None:
 
 def test_measures_fall_on_an_element_that_points_the_other_way() -> None:
     found = matched(run(np.arange(400.0, 700.0, 50.0), np.zeros(6)), site(TWO, TWO_LINKS))
-    assert found.path.elements() == ["a", "b"]
+    assert found.path.element_names() == ["a", "b"]
     assert np.allclose(found.epochs.table["path_m"], np.arange(400.0, 700.0, 50.0), atol=2e-3)
     assert np.allclose(found.epochs.table["measure_m"], [400, 450, 500, 450, 400, 350], atol=2e-3)
 
@@ -60,7 +60,7 @@ def test_only_the_elements_that_were_visited_are_on_the_path() -> None:
     elements = {name: line((500.0 * k, 0), (500.0 * k + 500, 0)) for k, name in enumerate("abcd")}
     links = [("a", 1, "b", 0, "both"), ("b", 1, "c", 0, "both"), ("c", 1, "d", 0, "both")]
     found = matched(run(np.arange(600.0, 1400.0, 20.0), np.zeros(40)), site(elements, links))
-    assert found.path.elements() == ["b", "c"]
+    assert found.path.element_names() == ["b", "c"]
     assert found.epochs.table["path_m"][0] == pytest.approx(100.0, abs=2e-3)
 
 
@@ -242,8 +242,8 @@ def on_first_leg(
     """Path positions, and how far left of the path [m]."""
     latitude_deg, longitude_deg = np.atleast_1d(latitude_deg), np.atleast_1d(longitude_deg)
     leg, height_m = np.zeros(len(latitude_deg), dtype=np.int64), np.full(len(latitude_deg), np.nan)
-    feet = path.feet(points_of(latitude_deg, longitude_deg), leg, np.isfinite(latitude_deg))
-    return path.places(leg, feet, height_m)[0], feet.offset_m
+    feet = path.nearest_feet(points_of(latitude_deg, longitude_deg), leg, np.isfinite(latitude_deg))
+    return path.path_positions(leg, feet, height_m)[0], feet.offset_m
 
 
 @settings(max_examples=60, deadline=None)
@@ -255,7 +255,7 @@ def test_locating_and_projecting_are_inverse(path_m: float, away_m: float) -> No
     segment = int(np.searchsorted(leg.path_start_m, path_m, side="right")) - 1
     share = (path_m - leg.path_start_m[segment]) / (leg.path_end_m[segment] - leg.path_start_m[segment])
     names, measures = path.locate(0, path_m)
-    rows = path.track.vertices(path.track.index[str(names[0])])
+    rows = path.track.vertex_range(path.track.index[str(names[0])])
     latitude = np.interp(measures[0], path.track.measure_m[rows], path.track.latitude_deg[rows])
     longitude = np.interp(measures[0], path.track.measure_m[rows], path.track.longitude_deg[rows])
     heading = np.radians(leg.heading_deg[segment])
@@ -299,13 +299,13 @@ def test_balises_get_their_path_position_in_order() -> None:
             "direction": ["AB", "BA", "AB", "AB"],
         }
     )
-    found = matched(run(np.arange(400.0, 700.0, 50.0), np.zeros(6)), site(TWO, TWO_LINKS)).path.balises(balises)
+    found = matched(run(np.arange(400.0, 700.0, 50.0), np.zeros(6)), site(TWO, TWO_LINKS)).path.balises_on_path(balises)
     assert found["balise_id"].to_list() == ["near", "far"]
     assert np.allclose(found["path_m"], [50.0, 900.0], atol=1e-3)
     # `b` is run against its measure: AB there is back along the path. Every train reads a physical one.
     assert found["valid_direction"].to_list() == [0, -1]
     unsaid = matched(run(np.arange(400.0, 700.0, 50.0), np.zeros(6)), site(TWO, TWO_LINKS)).path
-    assert unsaid.balises(balises.drop("direction"))["valid_direction"].to_list() == [0, 0]
+    assert unsaid.balises_on_path(balises.drop("direction"))["valid_direction"].to_list() == [0, 0]
 
 
 def test_a_run_somewhere_else_says_what_may_be_wrong() -> None:

@@ -54,13 +54,13 @@ def reviewed(number: int) -> list[str]:
 
 @pytest.mark.parametrize("number", [28876, 29304])
 def test_the_path_is_the_reviewed_one(number: int, network: Site) -> None:
-    assert matched(number, network).path.elements() == reviewed(number)
+    assert matched(number, network).path.element_names() == reviewed(number)
 
 
 def test_where_positions_lie_nearer_the_track_beside_that_is_shown_and_nothing_claimed(network: Site) -> None:
     """In a tunnel, 2 m from one track and 6 m from the reviewed one for a minute; before and behind both agree."""
     found, known = matched(31241, network), reviewed(31241)
-    shown = found.path.elements()
+    shown = found.path.element_names()
     assert (shown[:8], shown[-3:]) == (known[:8], known[-3:])
     beside = found.epochs.table.filter(~pl.col("netelement_id").is_in(known))
     assert beside.select(pl.max_horizontal("gate_probability", "path_probability").max()).item() < 0.99

@@ -61,9 +61,9 @@ def test_a_place_near_two_of_its_own_is_the_one_that_the_train_came_to(
     found = matched(fixes, place_of(points), odometer(at, RATE_HZ) if with_odometer else None, reads=reads)
     assert np.abs(found.epochs.table["path_m"].to_numpy() - at).max() < 8.0
     assert np.allclose(found.epochs.table["measure_m"], found.epochs.table["path_m"], atol=1e-6)
-    assert found.path.elements() == ["r"]
+    assert found.path.element_names() == ["r"]
     assert (found.epochs.table["path_probability"] >= 0.99).sum() > 0.95 * len(at)
-    assert found.path.balises(place_of(points).balises)["path_m"].to_list() == pytest.approx(
+    assert found.path.balises_on_path(place_of(points).balises)["path_m"].to_list() == pytest.approx(
         [60.0, len(points) - 61.0], abs=0.01
     )
 

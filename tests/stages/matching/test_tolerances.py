@@ -71,7 +71,7 @@ def test_balises_beyond_an_end_by_what_lists_round_lie_where_their_measure_says(
         }
     )
     fixes = run(np.arange(400.0, 50.0, -10.0), np.zeros(35))
-    found = match(fixes, None, place, Vehicle(), MatchingConfig(), FixSigma()).path.balises(balises)
+    found = match(fixes, None, place, Vehicle(), MatchingConfig(), FixSigma()).path.balises_on_path(balises)
     assert found["balise_id"].to_list() == ["beyond", "inside", "before"]
     assert found["path_m"].to_list() == pytest.approx([-0.4, 400.0, 500.4], abs=1e-3)
     assert found["sense"].to_list() == [-1, -1, -1]

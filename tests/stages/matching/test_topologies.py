@@ -47,7 +47,7 @@ def test_a_station_with_eight_tracks(number: int) -> None:
     points = np.concatenate([elements[name] for name in ("in", f"t{number}", "out")])
     at = np.arange(50.0, 1750.0, 8.0)
     found = matched(ride(points, at, number), place, odometer(at, RATE_HZ))
-    names = found.path.elements()
+    names = found.path.element_names()
     assert (names[0], names[-1], len(names)) == ("in", "out", 3)
     if names[1] != f"t{number}":
         assert found.epochs.table.filter(pl.col("netelement_id") == names[1])["path_probability"].max() < 0.9
@@ -82,7 +82,7 @@ def test_a_single_line_with_a_passing_loop() -> None:
     for name in ("m", "l"):
         points = np.concatenate([elements["w"], elements[name][1:], elements["e"][1:]])
         found = matched(ride(points, at, 3, sigma_m=0.3), site(elements, links), odometer(at, RATE_HZ))
-        assert found.path.elements() == ["w", name, "e"]
+        assert found.path.element_names() == ["w", name, "e"]
         assert found.ambiguous["resolved_by"].is_in(["switch", "positions"]).all()
 
 
@@ -102,7 +102,7 @@ def test_tracks_that_cross_are_not_changed(angle_deg: float, heights: bool) -> N
     for names in (["a", "b"], ["c", "d"]):
         points = np.concatenate([elements[names[0]], elements[names[1]][1:]])
         found = matched(ride(points, at, 5), place, odometer(at, RATE_HZ))
-        assert found.path.elements() == names
+        assert found.path.element_names() == names
         assert found.epochs.table["path_probability"].min() >= 0.99
 
 
@@ -129,7 +129,7 @@ def test_a_balloon_loop_brings_the_train_back_turned_round(seed: int) -> None:
     length = float(np.hypot(*np.diff(points, axis=0).T).sum())
     at = np.arange(50.0, length - 50.0, 10.0)
     found = matched(ride(points, at, seed), place, odometer(at, RATE_HZ))
-    assert found.path.elements() in (["s", "r", "q", "s"], ["s", "q", "r", "s"])
+    assert found.path.element_names() in (["s", "r", "q", "s"], ["s", "q", "r", "s"])
     moved = found.epochs.table["path_m"].to_numpy() - found.epochs.table["path_m"][0]
     assert np.abs(moved - (at - at[0])).max() < 5.0
 
@@ -164,7 +164,7 @@ def test_a_shuttle_turns_four_times_on_one_leg() -> None:
     once = np.arange(100.0, 1700.0, 10.0)
     at = np.concatenate([once, once[::-1], once, once[::-1], once])
     found = matched(ride(line((0, 0), (1800, 0)), at, 7), site(elements, links), odometer(at, RATE_HZ))
-    assert found.path.elements() == list("abc")
+    assert found.path.element_names() == list("abc")
     assert len(found.path.legs) == 1
     assert np.abs(found.epochs.table["path_m"].to_numpy() - at).max() < 5.0
 

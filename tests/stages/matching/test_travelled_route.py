@@ -125,7 +125,7 @@ def test_a_run_that_turned_back_over_a_switch_takes_its_own_route_again(tmp_path
     known = with_route(place, file, SiteConfig())
     assert isinstance(known, Site)
     again = matched(fixes, known, odometer(distance - distance[0]))
-    assert again.path.elements() == first.path.elements()
+    assert again.path.element_names() == first.path.element_names()
     assert again.ambiguous.height <= first.ambiguous.height
     assert set(again.epochs.table["netelement_id"]) <= {"s", "m", "d"}
 

@@ -7,9 +7,9 @@ import polars as pl
 import pytest
 
 from pipeline.stages.paths.candidates import candidates_of, search_about, segments_of
-from pipeline.stages.track.chords import _straightest, _wrapped
-from pipeline.stages.track.geodesy import distances_m, points_of
-from pipeline.stages.track.network import _onward, connected_parts, network_of
+from pipeline.stages.track.chords import _least_turns, _wrap_angle
+from pipeline.stages.track.geodesy import point_distances_m, points_of
+from pipeline.stages.track.network import _successors_of, connected_parts, network_of
 from pipeline.stages.track.segments import Polyline
 from pipeline.stages.track.survey import SurveyedTrack, track_of
 from schemas.conform import conform
@@ -42,7 +42,7 @@ def test_ways_keep_their_order_and_a_repeated_one_allows_what_either_does(seed: 
     here, there = rng.integers(0, 6, (2, 20))
     forward, backward = rng.integers(0, 2, (2, 20)).astype(np.bool_)
     gap_m = (here * 10 + there).astype(np.float64)
-    ways = _onward(6, here, there, gap_m, forward, backward)
+    ways = _successors_of(6, here, there, gap_m, forward, backward)
     for start in range(6):
         rows = np.flatnonzero(here == start)
         expected = {}
@@ -57,9 +57,11 @@ def test_the_straightest_way_on_is_the_first_with_the_least_turn(seed: int) -> N
     rng = np.random.default_rng(seed)
     leave_rad, enter_rad = rng.integers(-3, 4, (2, 10)).astype(np.float64)
     here, there = np.sort(rng.integers(0, 10, 25)), rng.integers(0, 10, 25)
-    onward, turn_rad = _straightest(leave_rad, enter_rad, here, there)
+    onward, turn_rad = _least_turns(leave_rad, enter_rad, here, there)
     for start in range(10):
-        turns = [(float(_wrapped(enter_rad[[to]] - leave_rad[start])[0]), to) for to in there[here == start].tolist()]
+        turns = [
+            (float(_wrap_angle(enter_rad[[to]] - leave_rad[start])[0]), to) for to in there[here == start].tolist()
+        ]
         turn, to = min(turns, key=lambda way: abs(way[0]), default=(0.0, -1))
         assert (onward[start], turn_rad[start]) == (to, turn)
 
@@ -86,7 +88,9 @@ def scattered(seed: int, heights: bool = False) -> SurveyedTrack:
 def test_measures_of_all_elements_are_those_of_each(seed: int, heights: bool) -> None:
     track = scattered(seed, heights)
     for _, _, part in track.elements():
-        steps_m = distances_m(track.latitude_deg[part], track.longitude_deg[part], np.nan_to_num(track.height_m[part]))
+        steps_m = point_distances_m(
+            track.latitude_deg[part], track.longitude_deg[part], np.nan_to_num(track.height_m[part])
+        )
         assert track.geometric_m[part].tolist() == [0.0, *np.cumsum(steps_m).tolist()]
 
 
@@ -109,7 +113,7 @@ def test_the_nearest_sample_is_the_nearest_of_all_however_far(seed: int) -> None
     track = scattered(seed)
     inside = np.setdiff1d(np.arange(len(track.surface) - 1), track.first[1:-1] - 1)
     line = Polyline(track.surface[inside], track.surface[inside + 1])
-    samples = Polyline(line.start, line.end).samples[0].data
+    samples = Polyline(line.start, line.end).sample_tree[0].data
     rng = np.random.default_rng(seed)
     # First about the line, then about that and far away, then only far away from all that was looked at.
     for degrees in ((50.0, 4.05), (50.5, 4.6), (20.0, 70.0), (51.9, 51.9)):
