@@ -58,7 +58,7 @@ class _OfProject(TyperCommand):
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
         given, _, _ = self.make_parser(ctx).parse_args(list(args))
         if not given.get("help") and (given.get("project") or Path("balise.toml").is_file()):
-            from pipeline.project.opened import taken_from_project
+            from pipeline.project.opened import values_from_project
 
             named = given.pop("project", None)
             missing = [option.name for option in self.params if given.get(option.name or "") in (None, [], ())]
@@ -67,7 +67,7 @@ class _OfProject(TyperCommand):
             shifted = second in missing and "out" not in missing
             missing = ["out"] if shifted else missing
             say = None if given.get("quiet") else _say
-            ctx.default_map = taken_from_project(named, self.name or "", missing, say)
+            ctx.default_map = values_from_project(named, self.name or "", missing, say)
             args = [ctx.default_map["out"], *args] if shifted and ctx.default_map else args
         return super().parse_args(ctx, args)
 
@@ -276,9 +276,9 @@ def init(
     as_json: Json = False,
 ) -> None:
     """Write a project from the contents of a folder: logs, runs, survey or site, balises, settings; or an empty one."""
-    from pipeline.project.init import wanted_in
+    from pipeline.project.init import wanted_of_folder
 
-    _write_project(wanted_in(folder), folder, accept_corrections, force, as_json)
+    _write_project(wanted_of_folder(folder), folder, accept_corrections, force, as_json)
 
 
 def _spacing(raws: list[Path], balises: str | None) -> tuple[list[Path], str | None]:
@@ -291,7 +291,7 @@ def _spacing(raws: list[Path], balises: str | None) -> tuple[list[Path], str | N
 
 def _write_project(wanted: Wanted, folder: Path, accept: bool, force: bool, as_json: bool) -> None:
     from datasets.recordings import recordings
-    from pipeline.project.init import answer_of, refuse_existing, words_of, write_project
+    from pipeline.project.init import json_answer, refuse_existing, result_lines, write_project
     from pipeline.project.trial import correction_lines, draft_project
 
     def asked(run_id: str, found: Sequence[str], corrections: Sequence[StreamCorrection]) -> bool:
@@ -304,7 +304,7 @@ def _write_project(wanted: Wanted, folder: Path, accept: bool, force: bool, as_j
     refuse_existing(folder, force)
     drafted = draft_project(wanted, folder, recordings(), asked)
     file = write_project(drafted, folder)
-    _tell(as_json, answer_of(drafted, file), {"Logs": drafted.logs}, *words_of(drafted, file))
+    _tell(as_json, json_answer(drafted, file), {"Logs": drafted.logs}, *result_lines(drafted, file))
 
 
 @_command("balise run", "balise run --project week12 --jobs 4")
@@ -320,7 +320,7 @@ def run(
     from datasets.recordings import recordings
     from pipeline.campaign import Interrupted
     from pipeline.project.opened import open_project
-    from pipeline.project.run import Call, run_project
+    from pipeline.project.run import CallOptions, run_project
     from pipeline.results.manifest import anchor, anchor_words
     from pipeline.show.progress import show_summary, summary_answer, watches
     from pipeline.show.terminal import how_far
@@ -329,10 +329,10 @@ def run(
     options = opened.project.replay
     out = opened.place(opened.project.out)
     named = _options(opened.vehicle_file, opened.config_file)
-    places = {"site": opened.place(opened.project.site), "options": named, **opened.words}
+    places = {"site": opened.place(opened.project.site), "options": named, **opened.message_words}
     pages = None if quiet or as_json else how_far("pages")
     at_once = (options.jobs if jobs is None else jobs) or os.cpu_count() or 1
-    call = Call(_steps(quiet, as_json), watches(quiet, as_json), pages, at_once, force, prune)
+    call = CallOptions(_steps(quiet, as_json), watches(quiet, as_json), pages, at_once, force, prune)
     try:
         ended = run_project(opened, recordings(), call)
     except Interrupted as interrupted:
@@ -344,7 +344,7 @@ def run(
         _print_json({**summary_answer(ended.summary, out), **made})
     else:
         show_summary(ended.summary, out, quiet, False, has_pages=ended.page is not None, **places)
-        for line in ended.lost(opened.file):
+        for line in ended.unread_words(opened.file):
             print(line, file=sys.stderr if quiet else sys.stdout)
     if not (quiet or as_json):
         print(f"Report: {ended.page}" + ("" if ended.changed else "\nAll was up to date."))
@@ -627,15 +627,15 @@ def make_a_site(
     as_json: Json = False,
 ) -> None:
     """Make a site from a survey of the line: net elements, links, balises, and a page to check it."""
-    from pipeline.make.survey.make import make_site, wish_of, write_made
+    from pipeline.make.survey.make import make_site, site_request, write_site
     from pipeline.read.site.describe import elements_table
     from pipeline.show.inspection import findings_table
     from pipeline.show.report.site_page import site_page
     from schemas.enums import TravelAlong
 
-    wish = wish_of(surveys, balises, epsg, join, flat, TravelAlong(direction), id_field, sigma)
+    wish = site_request(surveys, balises, epsg, join, flat, TravelAlong(direction), id_field, sigma)
     site = make_site(wish, _vehicle(vehicle), _configuration(config))
-    write_made(site, site_page(out.resolve().name, site), out, force)
+    write_site(site, site_page(out.resolve().name, site), out, force)
     elements, findings = elements_table(site), findings_table(site.findings)
     made = {"out": out, "page": out / "site.html", "elements": elements, "findings": findings, "balises": site.balises}
     count = 0 if site.balises is None else site.balises.height
@@ -924,12 +924,12 @@ def _from_raw_logs(logs: list[str], project: Path | None) -> list[Verification]:
     from datasets.recordings import recordings
     from pipeline.campaign import find_runs
     from pipeline.project.opened import project_here
-    from pipeline.project.reconvert import reconverted
+    from pipeline.project.reconvert import verify_conversion
 
     opened = project_here(project)
     if opened is None or not opened.project.convert:
         return []
-    return [reconverted(opened, recordings(), find_runs(logs).values())]
+    return [verify_conversion(opened, recordings(), find_runs(logs).values())]
 
 
 @_command("balise compact week12", "balise compact s3://trial/week12 --runs-per-file 5000")

@@ -9,7 +9,7 @@ from pathlib import Path
 from datasets import infrabel
 from datasets.comma2k19 import comma2k19_run
 from datasets.trial import write_run_as
-from pipeline.make.receivers import Converted, Purpose, as_run, extended, gather, said_of
+from pipeline.make.receivers import Converted, Purpose, as_run, extend_run, gather, words_for_dropped
 from pipeline.project.convert import Recordings
 from pipeline.read.ingest import read_run
 from pipeline.read.ingest.parts import LogPart, drafts_of, lines_of_parts
@@ -35,7 +35,9 @@ class Conversion:
 
     def lines(self) -> list[str]:
         """The result for people."""
-        unused = [f"{said_of(reason)}: {count} x {visible(reason)}" for reason, count in self.not_used.items()]
+        unused = [
+            f"{words_for_dropped(reason)}: {count} x {visible(reason)}" for reason, count in self.not_used.items()
+        ]
         made = [f"corrected: {visible(text)}" for text in self.corrected]
         listed = map(visible, [*lines_of_parts(self.parts), *drafts_of(self.parts)])
         return [f"{self.epochs} epochs in {self.run}", *unused, *made, *listed, *self.fit.lines()]
@@ -56,12 +58,12 @@ def convert_logs(
     settings = given or Configuration()
     with noting() as noted:
         recording = known_recording(logs[0]) if len(logs) == 1 and given is None else None
-        found = gather(logs, settings.ingest, day, purpose.solution) if recording is None else recording.gathered()
+        found = gather(logs, settings.ingest, day, purpose.solution) if recording is None else recording.as_gatherings()
         if recording is not None:
             note_all_below(logs[0])
     if to.is_file() or (to / "gnss.parquet").is_file():
         run = read_run(to, IngestConfig(), with_digest=False)
-        converted = extended(run, to, found, purpose, settings.fix_sigma, force, settings.ingest.correct)
+        converted = extend_run(run, to, found, purpose, settings.fix_sigma, force, settings.ingest.correct)
     else:
         name = to.name.removesuffix(".mcap")
         converted = as_run(found, name, purpose, settings.fix_sigma, settings.ingest.correct)

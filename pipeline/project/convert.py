@@ -9,8 +9,8 @@ from datetime import date
 from itertools import groupby
 from pathlib import Path
 
-from pipeline.make.receivers import Converted, Gatherings, Purpose, as_run, extended, gather
-from pipeline.project.opened import Opened
+from pipeline.make.receivers import Converted, Gatherings, Purpose, as_run, extend_run, gather
+from pipeline.project.opened import OpenedProject
 from pipeline.read.ingest import read_run
 from pipeline.read.ingest.correct import corrected, corrected_further
 from pipeline.storage.noted import note_all_below, noting
@@ -37,17 +37,17 @@ class _Part:
     found: Gatherings
 
 
-def logs_of(opened: Opened, entry: ConvertEntry) -> list[Path]:
+def logs_of(opened: OpenedProject, entry: ConvertEntry) -> list[Path]:
     """Every log of a run. Raises `UsageError` for one that is not there."""
-    return [path for log in entry.logs for path in _paths(opened, log, entry)]
+    return [path for log in entry.logs for path in _files_of_log(opened, log, entry)]
 
 
-def run_of_logs(
-    opened: Opened, entry: ConvertEntry, ingest: IngestConfig, sigmas: FixSigma, recordings: Recordings
+def convert_entry(
+    opened: OpenedProject, entry: ConvertEntry, ingest: IngestConfig, sigmas: FixSigma, recordings: Recordings
 ) -> Converted:
     """The run, corrected as the project says; raises `InputError` for logs that cannot be read."""
     with noting() as noted:
-        parts = _parts(opened, entry, ingest, recordings)
+        parts = _logs_by_purpose(opened, entry, ingest, recordings)
     parts.sort(key=lambda part: part.purpose.stream != "gnss" or "gnss" not in part.found.streams)
     first = parts[0]
     common = ingest.correct
@@ -55,7 +55,7 @@ def run_of_logs(
     dropped = Counter(made.dropped)
     listed = list(made.parts)
     for part in parts[1:]:
-        made = extended(made.run, Path(entry.to), part.found, part.purpose, sigmas, False, common)
+        made = extend_run(made.run, Path(entry.to), part.found, part.purpose, sigmas, False, common)
         dropped.update(made.dropped)
         listed += made.parts
     run = corrected(made.run, common)
@@ -64,37 +64,41 @@ def run_of_logs(
     return Converted(corrected_further(run, own), dict(dropped), tuple(listed)).made_of(noted.listing())
 
 
-def _parts(opened: Opened, entry: ConvertEntry, base: IngestConfig, recordings: Recordings) -> list[_Part]:
+def _logs_by_purpose(
+    opened: OpenedProject, entry: ConvertEntry, base: IngestConfig, recordings: Recordings
+) -> list[_Part]:
     """Logs of the same purpose are read together, so that two of the same time are refused."""
     ingest = _with_mappings(base, entry.logs)
     parts = []
-    for (purpose, day), logs in groupby(sorted(entry.logs, key=_call_key), key=_call_of):
+    for (purpose, day), logs in groupby(sorted(entry.logs, key=_reading_key), key=_purpose_and_date):
         paths = []
         for log in logs:
-            for path in _paths(opened, log, entry):
-                known = None if log.mappings() or day else _known(path, ingest, recordings)
+            for path in _files_of_log(opened, log, entry):
+                known = None if log.mappings() or day else _read_known_form(path, ingest, recordings)
                 if known is None:
                     paths.append(path)
                 else:
-                    parts.append(_Part(purpose, known.gathered()))
+                    parts.append(_Part(purpose, known.as_gatherings()))
         if paths:
             parts.append(_Part(purpose, gather(paths, ingest, day, purpose.solution)))
     return parts
 
 
-def _known(path: Path, config: IngestConfig, recordings: Recordings) -> Converted | None:
-    """A public recording, or a folder that is a run already."""
+def _read_known_form(path: Path, config: IngestConfig, recordings: Recordings) -> Converted | None:
+    """A public recording, or a folder that is a run already; None for any other."""
     note_all_below(path)
     if (path / "gnss.parquet").is_file():
         return Converted(read_run(path, config, with_digest=False), {})
     return recordings.known(path)
 
 
-def _call_of(log: LogEntry) -> tuple[Purpose, date | None]:
+def _purpose_and_date(log: LogEntry) -> tuple[Purpose, date | None]:
+    """What the positions of a log are for, and the date of its first epoch."""
     return Purpose(log.solution, log.stream), log.date
 
 
-def _call_key(log: LogEntry) -> tuple[str, str, str]:
+def _reading_key(log: LogEntry) -> tuple[str, str, str]:
+    """Sorts logs by what is read in one call."""
     return log.stream, log.solution or "", str(log.date or "")
 
 
@@ -106,7 +110,7 @@ def _with_mappings(base: IngestConfig, logs: tuple[LogEntry, ...]) -> IngestConf
     return base.model_copy(update={"correct": (), **joined})
 
 
-def _paths(opened: Opened, log: LogEntry, entry: ConvertEntry) -> list[Path]:
+def _files_of_log(opened: OpenedProject, log: LogEntry, entry: ConvertEntry) -> list[Path]:
     """The files of a log, patterns resolved."""
     found: list[Path] = []
     for named in log.files:

@@ -30,17 +30,17 @@ Found = dict[Kind, list[Path]]
 
 
 def is_site(path: Path) -> bool:
-    """A folder with a track."""
+    """Whether a path is a folder with a track."""
     return path.is_dir() and any((path / name).exists() for name in _SITE_FILES)
 
 
 def is_one_log(path: Path) -> bool:
-    """A file, a run, a bag, or a public recording: not a folder of logs."""
+    """Whether a path is one log: a file, a run, a bag, or a public recording; not a folder of logs."""
     return path.is_file() or is_run(path) or is_bag(path) or (path / "processed_log").is_dir()
 
 
 def is_prose(path: Path) -> bool:
-    """A text without columns, as notes are."""
+    """Whether a path is a text without columns, as notes are."""
     try:
         return path.suffix.lower() == ".txt" and read_log_table(path, infer=True).table.width < 2
     except BaliseError:
@@ -55,44 +55,47 @@ def logs_below(folder: Path) -> list[Path]:
 def look_around(folder: Path) -> Found:
     """Sort what lies in a folder and those below it, by names and headers; results and hidden files are passed over."""
     found: Found = {kind: [] for kind in get_args(Kind)}
-    for path in _walk(folder):
+    for path in _walk_once(folder):
         if (kind := _kind_of(path)) is not None:
             found[kind].append(path)
     return found
 
 
-def _walk(folder: Path) -> Iterator[Path]:
+def _walk_once(folder: Path) -> Iterator[Path]:
     """Regular files, and folders that are one thing, each once: by its own name rather than by that of a link."""
     seen = {os.path.realpath(folder)}
     links: list[Path] = []
-    yield from _inside(folder, seen, links)
+    yield from _things_inside(folder, seen, links)
     while links:
         link = links.pop(0)
-        if _is_new(link, seen):
-            yield from _at(link, seen, links)
+        if _note_if_new(link, seen):
+            yield from _things_at(link, seen, links)
 
 
-def _inside(folder: Path, seen: set[str], links: list[Path]) -> Iterator[Path]:
+def _things_inside(folder: Path, seen: set[str], links: list[Path]) -> Iterator[Path]:
+    """Files and things inside a folder that were not seen yet; links are put off."""
     for path in sorted(folder.iterdir()):
         if path.is_symlink():
             links.append(path)
-        elif _is_new(path, seen):
-            yield from _at(path, seen, links)
+        elif _note_if_new(path, seen):
+            yield from _things_at(path, seen, links)
 
 
-def _is_new(path: Path, seen: set[str]) -> bool:
+def _note_if_new(path: Path, seen: set[str]) -> bool:
+    """Whether a path is seen for the first time, by its own name; it is then."""
     real = os.path.realpath(path)
     is_new = real not in seen
     seen.add(real)
     return is_new
 
 
-def _at(path: Path, seen: set[str], links: list[Path]) -> Iterator[Path]:
+def _things_at(path: Path, seen: set[str], links: list[Path]) -> Iterator[Path]:
+    """The thing at a path, or those below it; nothing for results and hidden files."""
     if path.name.startswith(".") or path.name == FILE_NAME or (path / "manifest.json").is_file():
         return
     require_name(path)
     if path.is_dir() and not is_site(path) and not is_one_log(path):
-        yield from _inside(path, seen, links)
+        yield from _things_inside(path, seen, links)
     elif path.is_dir() or (path.is_file() and path.suffix.lower() not in _COMPANION_SUFFIXES):
         yield path
 
@@ -107,6 +110,7 @@ def require_name(path: Path) -> None:
 
 
 def _kind_of(path: Path) -> Kind | None:
+    """What a file or folder is by its name and header."""
     suffix = path.suffix.lower()
     if is_site(path):
         return "sites"
@@ -118,13 +122,13 @@ def _kind_of(path: Path) -> Kind | None:
 
 
 def _holds_gpsd(path: Path) -> bool:
-    """What gpsd reported is a log, though its name ends like that of a map."""
+    """Whether a file is a log of gpsd, though its name ends like that of a map."""
     with path.open("rb") as stream:
         return is_gpsd(stream.read(HEAD))
 
 
 def _kind_of_settings(path: Path) -> Kind | None:
-    """A vehicle or a configuration file: what it can be read as."""
+    """Whether a TOML file is a vehicle file or a configuration: what it can be read as."""
     kinds: dict[Kind, type[Settings]] = {"vehicles": Vehicle, "configs": Configuration}
     for kind, settings in kinds.items():
         with contextlib.suppress(BaliseError):
@@ -134,7 +138,7 @@ def _kind_of_settings(path: Path) -> Kind | None:
 
 
 def _kind_of_table(path: Path) -> Kind:
-    """A table without a time is no log: it lists balises, or points of a line."""
+    """Whether a table is a log, or lists balises or points of a line: without a time it is no log."""
     try:
         table = read_log_table(path, infer=True).table
     except BaliseError:

@@ -21,7 +21,7 @@ _ONE_OF: dict[Kind, str] = {
 }
 
 
-def wanted_in(folder: Path) -> Wanted:
+def wanted_of_folder(folder: Path) -> Wanted:
     """What a folder offers for a project. Raises `UsageError` where there are several of what there can be one of."""
     if not folder.exists():
         return Wanted(())
@@ -41,7 +41,7 @@ def wanted_in(folder: Path) -> Wanted:
 
 
 def refuse_existing(folder: Path, force: bool) -> None:
-    """A project that is there stays, unless `force`."""
+    """Refuse to write over a project that is there, unless `force`."""
     file = folder / FILE_NAME
     if file.exists() and not force:
         raise UsageError("is there already", place=str(file), remedy="Edit it, or write it anew with --force.")
@@ -59,8 +59,8 @@ def next_command(file: Path) -> str:
     return "balise run" if file.parent.resolve() == Path.cwd() else f"balise run --project {file.parent}"
 
 
-def words_of(drafted: Drafted, file: Path) -> list[str]:
-    """What there is to say, and the command that comes next."""
+def result_lines(drafted: Drafted, file: Path) -> list[str]:
+    """Lines on what was written and left out, and the command that comes next."""
     words = [""]
     for proposal in drafted.proposals:
         words += [f"{proposal.run_id} does not fit as recorded:", *(f"  {sentence}" for sentence in proposal.found)]
@@ -79,7 +79,7 @@ _DRAFTS = (
 _UNACCEPTED = "they stand in the file as comments; remove the # or add --accept-corrections."
 
 
-def answer_of(drafted: Drafted, file: Path) -> dict[str, Any]:
+def json_answer(drafted: Drafted, file: Path) -> dict[str, Any]:
     """What `balise init --json` prints."""
     proposals = [vars(proposal) | {"toml": correction_lines(proposal.corrections)} for proposal in drafted.proposals]
     fields = ("run_id", "found", "toml", "accepted")

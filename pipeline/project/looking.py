@@ -13,8 +13,8 @@ import polars as pl
 
 from pipeline.campaign.plan import is_run
 from pipeline.make.receivers import gather
-from pipeline.make.receivers.convert import of_topics
-from pipeline.make.receivers.csv import TABLES, names_file
+from pipeline.make.receivers.convert import mappings_of_topics
+from pipeline.make.receivers.csv import TABLES, maps_file
 from pipeline.make.receivers.messages import UnknownError
 from pipeline.project.convert import Recordings
 from pipeline.read.ingest import read_run
@@ -56,35 +56,36 @@ class InspectedLog:
 
     @property
     def has_positions(self) -> bool:
-        """It holds positions of a receiver."""
+        """Whether it holds positions of a receiver."""
         return "gnss" in self.spans
 
     @property
     def start(self) -> datetime:
         """Begin of the positions, else of all streams."""
-        return min(span.start for span in self._spans())
+        return min(span.start for span in self._deciding_spans())
 
     @property
     def end(self) -> datetime:
         """The last instant of any stream."""
-        return max(span.end for span in self._spans())
+        return max(span.end for span in self._deciding_spans())
 
     def overlaps(self, other: InspectedLog) -> bool:
         """Whether the times of two logs overlap."""
         return self.start < other.end and other.start < self.end
 
-    def _spans(self) -> list[StreamSpan]:
+    def _deciding_spans(self) -> list[StreamSpan]:
+        """Spans that its time is taken from: of the positions, else of all streams."""
         return [self.spans["gnss"]] if self.has_positions else list(self.spans.values())
 
 
 def look_at_dates(path: Path, config: IngestConfig, others: Sequence[InspectedLog]) -> InspectedLog | None:
     """A table whose dates may be day first or month first: in the one order that puts it within a day of other logs."""
-    if path.suffix.lower() not in TABLES or names_file(config, path):
+    if path.suffix.lower() not in TABLES or maps_file(config, path):
         return None
     fitting: list[InspectedLog] = []
     for order in ("day_first", "month_first"):
         try:
-            log = _table(path, config, order)
+            log = _look_at_table(path, config, order)
         except BaliseError:
             continue
         if any(log.start < other.end + _A_DAY and other.start < log.end + _A_DAY for other in others):
@@ -96,25 +97,25 @@ def look_at_dates(path: Path, config: IngestConfig, others: Sequence[InspectedLo
 def look_at(path: Path, config: IngestConfig, day: date | None, recordings: Recordings) -> InspectedLog:
     """Read a log to see what it feeds. Raises `InputError` where nothing can be made of it."""
     if is_run(path):
-        return _run(path, config)
-    known = None if names_file(config, path) else recordings.known(path)
+        return _look_at_run(path, config)
+    known = None if maps_file(config, path) else recordings.known(path)
     if known is not None:
-        return _inspected(path, known.gathered().streams, parts=known.parts)
-    if path.suffix.lower() == ".csv" and not names_file(config, path):
-        return _table(path, config)
+        return _inspected_log(path, known.as_gatherings().streams, parts=known.parts)
+    if path.suffix.lower() == ".csv" and not maps_file(config, path):
+        return _look_at_table(path, config)
     try:
         found = gather([path], config, day)
-        return _inspected(path, found.streams, parts=found.parts)
+        return _inspected_log(path, found.streams, parts=found.parts)
     except UnknownError:
         if path.suffix.lower() not in TABLES:
             raise
-        return _table(path, config)
+        return _look_at_table(path, config)
 
 
-def _run(path: Path, config: IngestConfig) -> InspectedLog:
+def _look_at_run(path: Path, config: IngestConfig) -> InspectedLog:
     """A run; an MCAP log without positions is a log that another one needs."""
     if path.suffix.lower() == ".mcap":
-        own = of_topics(config, path)
+        own = mappings_of_topics(config, path)
         census = Census()
         run = read_part([path], own, partly=True, beside=[census])
         parts = tuple(parts_of_topics(path.name, topics_in([census], own), run.notes.skipped_topics))
@@ -122,7 +123,7 @@ def _run(path: Path, config: IngestConfig) -> InspectedLog:
         run = read_run(path, config, with_digest=False)
         parts = _parts_of_folder(path, run)
     streams = {name: frame for name in STREAMS if (frame := run.stream(name)) is not None and frame.height}
-    return _inspected(path, streams, is_run="gnss" in streams, parts=parts)
+    return _inspected_log(path, streams, is_run="gnss" in streams, parts=parts)
 
 
 def _parts_of_folder(path: Path, run: RunLog) -> tuple[LogPart, ...]:
@@ -132,13 +133,14 @@ def _parts_of_folder(path: Path, run: RunLog) -> tuple[LogPart, ...]:
     return (*whole, *(LogPart(path.name, "file", name, 0) for name in run.notes.skipped_topics))
 
 
-def _inspected(
+def _inspected_log(
     path: Path,
     streams: Mapping[Stream, pl.DataFrame],
     mapping: Mapping[str, list[dict[str, Any]]] | None = None,
     is_run: bool = False,
     parts: tuple[LogPart, ...] = (),
 ) -> InspectedLog:
+    """What was seen of a log; raises `InputError` where no stream has a time."""
     spans: dict[Stream, StreamSpan] = {}
     for name, frame in streams.items():
         times = frame.to_series(0).drop_nulls()
@@ -151,7 +153,7 @@ def _inspected(
     return InspectedLog(path, spans, mapping or {}, is_run, gnss is not None and 2 * fixed > gnss.height, parts)
 
 
-def _table(path: Path, config: IngestConfig, date_order: str | None = None) -> InspectedLog:
+def _look_at_table(path: Path, config: IngestConfig, date_order: str | None = None) -> InspectedLog:
     """A table by the mapping that its header suggests."""
     text = draft_mapping(path)
     drafted = toml_of(text.encode(), f"mapping of {path}").get("ingest")
@@ -160,7 +162,7 @@ def _table(path: Path, config: IngestConfig, date_order: str | None = None) -> I
     if not mapping or any("time" not in entry for entries in mapping.values() for entry in entries):
         left_open = re.search(r"(?m)^# (time = .*?)  # (in .*)$", text)
         reason = "the names of its columns do not tell " + ("its time" if mapping else "what they are")
-        raise _undecided(path, f"{left_open[1]} is {left_open[2]}" if left_open else reason)
+        raise _undecided_error(path, f"{left_open[1]} is {left_open[2]}" if left_open else reason)
     for entries in mapping.values():
         for entry in entries:
             entry["topic"] = path.name
@@ -170,14 +172,15 @@ def _table(path: Path, config: IngestConfig, date_order: str | None = None) -> I
     try:
         found = gather([path], ingest)
     except InputError as error:
-        raise _undecided(path, error.message, error) from None
+        raise _undecided_error(path, error.message, error) from None
     own = {name: [{k: v for k, v in entry.items() if k != "topic"} for entry in of] for name, of in mapping.items()}
     assumed = ('its GPS times are taken for UTC; `time_scale = "gps"` in its mapping if they are 18 s ahead',)
-    log = _inspected(path, found.streams, own, parts=found.parts)
+    log = _inspected_log(path, found.streams, own, parts=found.parts)
     return replace(log, assumed=assumed) if "\n# time_scale = " in text else log
 
 
-def _undecided(path: Path, why: str, error: InputError | None = None) -> InputError:
+def _undecided_error(path: Path, why: str, error: InputError | None = None) -> InputError:
+    """The error for a table whose columns need a mapping."""
     hint = f"`balise inspect {path}` prints a draft: complete it as config.toml, and add --config config.toml."
     return InputError(
         f"needs a mapping of its columns: {why}",

@@ -48,13 +48,14 @@ class Product:
 
     @property
     def above(self) -> Path:
-        """Files are noted as seen from here."""
+        """The folder from which its files are noted."""
         return self.place.parent
 
 
 class Brought(NamedTuple):
-    """Whether a product was made; `undigested`: inputs that changed while they were read, or cannot be digested, so
-    that the next call makes it again.
+    """Whether a product was made by this call.
+
+    `undigested`: inputs that changed while they were read, or cannot be digested, so that the next call makes it again.
     """
 
     made: bool
@@ -73,7 +74,7 @@ class Record:
         except ValidationError:
             self._made = {}
 
-    def bring(self, product: Product, make: Callable[[], Sequence[Path]]) -> Brought:
+    def make_if_changed(self, product: Product, make: Callable[[], Sequence[Path]]) -> Brought:
         """Make a product unless it is up to date: unless settings, all that was read for it, and its files are equal.
 
         Raises `UsageError` where its files are there and this project did not make them, or they were changed since.
@@ -84,36 +85,39 @@ class Record:
                 return Brought(made=False)
             if known is None or not known.begun:
                 _refuse_foreign(product, known)
-        before = _digests(product.above, _names(product))
+        before = _file_digests(product.above, _file_names(product))
         # Whoever is killed now leaves files that the next call must not take for somebody else's.
-        self._note(product, _Made(of=product.settings, files={} if known is None else known.files, begun=True))
+        self._write_entry(product, _Made(of=product.settings, files={} if known is None else known.files, begun=True))
         try:
             with noting() as noted:
                 files = make()
         except Exception:
-            if _digests(product.above, _names(product)) == before:
-                self._note(product, known)
+            if _file_digests(product.above, _file_names(product)) == before:
+                self._write_entry(product, known)
             raise
         names = [file.relative_to(product.above).as_posix() for file in files]
-        read = {self._named(place): digest for place, digest in sorted(noted.digests().items())}
-        self._note(product, _Made(of=product.settings, read=read, files=_digests(product.above, names)))
+        read = {self._noted_name(place): digest for place, digest in sorted(noted.digests().items())}
+        self._write_entry(product, _Made(of=product.settings, read=read, files=_file_digests(product.above, names)))
         return Brought(True, tuple(place for place, digest in read.items() if digest == NO_DIGEST))
 
     def _is_up_to_date(self, product: Product, known: _Made) -> bool:
         """What cannot be digested has no equal."""
-        if known.begun or known.of != product.settings or known.files != _digests(product.above, known.files):
+        if known.begun or known.of != product.settings or known.files != _file_digests(product.above, known.files):
             return False
         return NO_DIGEST not in known.read.values() and all(
-            digest_now(self._place(name)) == digest for name, digest in known.read.items()
+            digest_now(self._noted_place(name)) == digest for name, digest in known.read.items()
         )
 
-    def _named(self, place: str) -> str:
+    def _noted_name(self, place: str) -> str:
+        """The name under which an input is noted."""
         return place if is_url(place) else named_from(Path(place), self._folder)
 
-    def _place(self, name: str) -> str:
+    def _noted_place(self, name: str) -> str:
+        """The place of an input by the name under which it is noted."""
         return name if is_url(name) else os.path.normpath(self._folder / name)
 
-    def _note(self, product: Product, made: _Made | None) -> None:
+    def _write_entry(self, product: Product, made: _Made | None) -> None:
+        """Note what a product was made of, or that it is gone, and write the file."""
         self._made.pop(product.name, None)
         if made is not None:
             self._made[product.name] = made
@@ -123,7 +127,7 @@ class Record:
 
 def _refuse_foreign(product: Product, known: _Made | None) -> None:
     """Refuse what somebody else made, changed or added. What is gone is made again."""
-    there = _digests(product.above, _names(product))
+    there = _file_digests(product.above, _file_names(product))
     if known is None:
         if there:
             raise UsageError(
@@ -149,14 +153,14 @@ def _refuse_foreign(product: Product, known: _Made | None) -> None:
         )
 
 
-def _names(product: Product) -> list[str]:
+def _file_names(product: Product) -> list[str]:
     """The file of a product, or those in its folder, as they are noted."""
     place = product.place
     files = [place] if place.is_file() else [file for file in sorted(place.rglob("*")) if file.is_file()]
     return [file.relative_to(product.above).as_posix() for file in files]
 
 
-def _digests(folder: Path, names: Iterable[str]) -> dict[str, str]:
+def _file_digests(folder: Path, names: Iterable[str]) -> dict[str, str]:
     """The SHA-256 of files below a folder; empty where a file is gone."""
     places = {name: folder / name for name in sorted(names)}
     return {name: storage.file_digests(path)[0].sha256 if path.is_file() else "" for name, path in places.items()}

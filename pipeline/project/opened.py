@@ -21,7 +21,7 @@ RECORD = ".balise"
 
 
 @frozen
-class Opened:
+class OpenedProject:
     """A project and its file; places that it names are told as seen from the working directory."""
 
     file: Path
@@ -47,7 +47,7 @@ class Opened:
         return None if named is None else Path(self.place(named))
 
     @property
-    def words(self) -> dict[str, str]:
+    def message_words(self) -> dict[str, str]:
         """What sentences on a project name: its file, the option where it is not that of the working directory."""
         option = "" if self.file == Path(FILE_NAME) else f" --project {self.folder}"
         made = "made" if self.project.track is not None else "given"
@@ -98,17 +98,17 @@ class Opened:
         ]
 
 
-def open_project(named: Path | None) -> Opened:
+def open_project(named: Path | None) -> OpenedProject:
     """The project of a folder or file. Raises `UsageError` where there is none, `ConfigError` for a wrong key."""
     file = named or Path()
     file = file / FILE_NAME if file.is_dir() else file
     if not file.is_file():
         remedy = "`balise trial RAW... --track LINE --balises B --to FOLDER` or `balise init FOLDER` writes one."
         raise UsageError("there is no project", place=str(file), expected=f"a file {FILE_NAME}", remedy=remedy)
-    return Opened(file, load_project(file))
+    return OpenedProject(file, load_project(file))
 
 
-def project_here(named: Path | None) -> Opened | None:
+def project_here(named: Path | None) -> OpenedProject | None:
     """The project that was named, or that of the working directory, if any."""
     file = Path(FILE_NAME)
     if named is not None or (file.is_file() and is_project(read_toml(file))):
@@ -116,7 +116,7 @@ def project_here(named: Path | None) -> Opened | None:
     return None
 
 
-def values_for(command: str, opened: Opened) -> dict[str, Any]:
+def values_for(command: str, opened: OpenedProject) -> dict[str, Any]:
     """What a command takes where its own options are not given, by the names of its parameters."""
     project = opened.project
     out = opened.place(project.out)
@@ -144,13 +144,13 @@ def values_for(command: str, opened: Opened) -> dict[str, Any]:
     return {name: value for name, value in values.get(command, {}).items() if value not in (None, [], False)}
 
 
-def _options_of(opened: Opened, entry: Settings, *paths: str) -> dict[str, Any]:
+def _options_of(opened: OpenedProject, entry: Settings, *paths: str) -> dict[str, Any]:
     """What a table of the project sets; `paths`: what of it are places."""
     given = entry.model_dump(exclude_unset=True)
     return given | {name: opened.path(given[name]) for name in paths if name in given}
 
 
-def taken_from_project(
+def values_from_project(
     named: str | None, command: str, missing: Sequence[str | None], say: Callable[[str], None] | None
 ) -> dict[str, Any]:
     """What a command takes from the project for parameters that are missing, said in one line."""
@@ -161,12 +161,12 @@ def taken_from_project(
     _require_measured(opened, values)
     taken = {name: value for name, value in values.items() if name in missing}
     if taken and say is not None:
-        taken_words = ", ".join(f"{name} {_shown(value)}" for name, value in taken.items())
+        taken_words = ", ".join(f"{name} {_option_text(value)}" for name, value in taken.items())
         say(f"balise: from {opened.file}: {taken_words}")
     return values
 
 
-def _require_measured(opened: Opened, values: dict[str, Any]) -> None:
+def _require_measured(opened: OpenedProject, values: dict[str, Any]) -> None:
     """What a calibration has not measured yet cannot be used."""
     measured = opened.folder / RECORD
     absent = [value for value in values.values() if isinstance(value, Path) and value.parent == measured]
@@ -174,7 +174,8 @@ def _require_measured(opened: Opened, values: dict[str, Any]) -> None:
         raise UsageError("is not calibrated yet", place=str(opened.file), remedy="`balise run` does it.")
 
 
-def _shown(value: object) -> str:
+def _option_text(value: object) -> str:
+    """A value as it would be typed."""
     return " ".join(map(str, value)) if isinstance(value, list) else str(value)
 
 

@@ -8,7 +8,7 @@ import polars as pl
 
 from pipeline.make.receivers.bags import describe_bag, is_bag
 from pipeline.make.receivers.convert import as_run, gather
-from pipeline.make.receivers.csv import TABLES, names_file
+from pipeline.make.receivers.csv import TABLES, maps_file
 from pipeline.make.receivers.messages import UnknownError
 from pipeline.read.ingest.describe import description_of
 from pipeline.show.inspection import PARTS, inspect_csv, parts_table, tables_of_log
@@ -26,7 +26,7 @@ def inspect_raw(
     try:
         found = gather([path], config.ingest)
     except UnknownError:
-        if path.suffix.lower() in TABLES and not names_file(config.ingest, path):
+        if path.suffix.lower() in TABLES and not maps_file(config.ingest, path):
             return inspect_csv(path, config.ingest)
         raise
     run: RunLog | None = None

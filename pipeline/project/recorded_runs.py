@@ -29,7 +29,7 @@ class RecordedRun:
 
     @property
     def is_ready(self) -> bool:
-        """A single run that needs no conversion."""
+        """Whether it is a single run that needs no conversion."""
         return [log.is_run for log in self.logs] == [True]
 
 
@@ -44,7 +44,7 @@ def group_into_runs(
     recorded_runs: list[RecordedRun] = []
     positions = [log for log in logs if log.has_positions and log.path not in references]
     for log in sorted(positions, key=lambda log: (log.start, logs.index(log))):
-        _place(log, recorded_runs)
+        _assign_log(log, recorded_runs)
     alone: list[InspectedLog] = []
     for log in logs:
         if log in positions:
@@ -52,7 +52,11 @@ def group_into_runs(
         homes = (
             recorded_runs
             if len(recorded_runs) == 1
-            else [recorded_run for recorded_run in recorded_runs if any(map(log.overlaps, _tested(recorded_run)))]
+            else [
+                recorded_run
+                for recorded_run in recorded_runs
+                if any(map(log.overlaps, _logs_of_receivers(recorded_run)))
+            ]
         )
         for recorded_run in homes:
             (recorded_run.references if log.path in references else recorded_run.others).append(log)
@@ -61,10 +65,10 @@ def group_into_runs(
     # The receiver named first is the one under test.
     for recorded_run in recorded_runs:
         recorded_run.receivers.sort(key=lambda files: min(map(logs.index, files)))
-    return _with_own_names(recorded_runs), alone
+    return _with_unique_names(recorded_runs), alone
 
 
-def _place(log: InspectedLog, recorded_runs: list[RecordedRun]) -> None:
+def _assign_log(log: InspectedLog, recorded_runs: list[RecordedRun]) -> None:
     """A log continues a file of its kind, is another receiver of a ride, or begins a ride."""
     for recorded_run in recorded_runs:
         for files in recorded_run.receivers:
@@ -73,13 +77,14 @@ def _place(log: InspectedLog, recorded_runs: list[RecordedRun]) -> None:
                 files.append(log)
                 return
     for recorded_run in recorded_runs:
-        if any(map(log.overlaps, _tested(recorded_run))):
+        if any(map(log.overlaps, _logs_of_receivers(recorded_run))):
             recorded_run.receivers.append([log])
             return
     recorded_runs.append(RecordedRun(stem_of(log.path), [[log]]))
 
 
-def _tested(recorded_run: RecordedRun) -> list[InspectedLog]:
+def _logs_of_receivers(recorded_run: RecordedRun) -> list[InspectedLog]:
+    """Logs of all receivers of a run."""
     return [log for files in recorded_run.receivers for log in files]
 
 
@@ -90,7 +95,7 @@ def stem_of(path: Path) -> str:
     return path.name if path.is_dir() else path.stem
 
 
-def _with_own_names(recorded_runs: list[RecordedRun]) -> list[RecordedRun]:
+def _with_unique_names(recorded_runs: list[RecordedRun]) -> list[RecordedRun]:
     """Run ids by the first log of each ride; logs of one name in several folders take the folder's name too."""
     firsts = [recorded_run.receivers[0][0].path for recorded_run in recorded_runs]
     stems = [stem_of(path) for path in firsts]

@@ -10,11 +10,11 @@ from pathlib import Path
 from pipeline import storage
 from pipeline.campaign import CampaignSummary, Plan, find_runs, make_plan, run_campaign
 from pipeline.campaign.watch import Follower
-from pipeline.make.receivers import said_of
-from pipeline.make.survey.make import Wish, make_site, wish_of, write_made
-from pipeline.project.convert import Recordings, logs_of, run_of_logs
+from pipeline.make.receivers import words_for_dropped
+from pipeline.make.survey.make import SiteRequest, make_site, site_request, write_site
+from pipeline.project.convert import Recordings, convert_entry, logs_of
 from pipeline.project.made import Product, Record, digest_over
-from pipeline.project.opened import MEASURED_CONFIG, MEASURED_VEHICLE, RECORD, Opened, named_from
+from pipeline.project.opened import MEASURED_CONFIG, MEASURED_VEHICLE, RECORD, OpenedProject, named_from
 from pipeline.read.ingest import read_run
 from pipeline.read.site.alike import summarise_findings
 from pipeline.read.site.read import read_site
@@ -35,7 +35,7 @@ Said = Callable[[str, str], None]
 
 
 @frozen
-class Call:
+class CallOptions:
     """What one call of `balise run` adds: none of it decides a result. `prune`: results of other runs are removed."""
 
     said: Said
@@ -47,7 +47,7 @@ class Call:
 
 
 @frozen
-class Ended:
+class ProjectOutcome:
     """How the replay ended, and the first page of the report; `changed`: whether anything had to be done.
 
     `unread`: logs of the trial that no run was made of, since they could not be read.
@@ -58,7 +58,7 @@ class Ended:
     changed: bool
     unread: Sequence[str] = ()
 
-    def lost(self, file: Path) -> list[str]:
+    def unread_words(self, file: Path) -> list[str]:
         """A sentence on each log that could not be read, for whoever reads the verdict."""
         return [
             f"NOT REPLAYED: {log} could not be read, and no figure knows of it. Mend it and name it in a [[convert]] "
@@ -71,15 +71,15 @@ class Ended:
 class _Steps:
     """A project on its way: which steps had something to do."""
 
-    opened: Opened
+    opened: OpenedProject
     recordings: Recordings
-    call: Call
+    call: CallOptions
     record: Record
     changed: list[str] = field(default_factory=list)
 
-    def bring(self, product: Product, make: Callable[[], Sequence[Path]]) -> bool:
+    def make_if_changed(self, product: Product, make: Callable[[], Sequence[Path]]) -> bool:
         """Make a product where its inputs changed; whether it was made."""
-        brought = self.record.bring(product, make)
+        brought = self.record.make_if_changed(product, make)
         if brought.made:
             self.changed.append(product.name)
         for place in brought.undigested:
@@ -88,21 +88,21 @@ class _Steps:
         return brought.made
 
 
-def run_project(opened: Opened, recordings: Recordings, call: Call) -> Ended:
+def run_project(opened: OpenedProject, recordings: Recordings, call: CallOptions) -> ProjectOutcome:
     """Do what is left to do. Raises `InputError` where logs cannot be converted: then nothing is replayed.
 
     Raises `Interrupted` when asked to stop; the same call then does the rest.
     """
     steps = _Steps(opened, recordings, call, Record(opened.folder, call.force))
-    _convert(steps)
-    _make_site(steps)
-    _calibrate(steps)
+    _convert_runs(steps)
+    _make_site_if_changed(steps)
+    _calibrate_if_changed(steps)
     plan = plan_of(opened)
-    _only_these(plan, call)
+    _refuse_other_results(plan, call)
     options = opened.project.replay
     call.said("replay", f"{len(plan.jobs)} runs")
     summary = run_campaign(
-        _calibrated(steps, plan),
+        _with_calibration(steps, plan),
         jobs=call.jobs,
         scheduler=options.scheduler,
         force=call.force,
@@ -110,10 +110,10 @@ def run_project(opened: Opened, recordings: Recordings, call: Call) -> Ended:
         watches=call.watches,
     )
     changed = bool(steps.changed) or not all(outcome.skipped for outcome in summary.outcomes)
-    return Ended(summary, _report(steps, plan), changed, [*map(opened.place, opened.project.unread)])
+    return ProjectOutcome(summary, _write_report(steps, plan), changed, [*map(opened.place, opened.project.unread)])
 
 
-def plan_of(opened: Opened) -> Plan:
+def plan_of(opened: OpenedProject) -> Plan:
     """The replay of all runs, each with its own vehicle file."""
     project = opened.project
     config = load_configuration(opened.config_file)
@@ -132,7 +132,7 @@ def plan_of(opened: Opened) -> Plan:
     return _with_vehicles(plan, opened) if project.vehicles else plan
 
 
-def _with_vehicles(plan: Plan, opened: Opened) -> Plan:
+def _with_vehicles(plan: Plan, opened: OpenedProject) -> Plan:
     """Runs, each with the vehicle file that the project names for it."""
     files = {job.run_id: opened.vehicle_of(job.run_id) for job in plan.jobs}
     vehicles = {file: load_settings(file, Vehicle) for file in set(files.values())}
@@ -144,7 +144,7 @@ def _with_vehicles(plan: Plan, opened: Opened) -> Plan:
     return replace(plan, jobs=jobs, given_by_digest=given)
 
 
-def _convert(steps: _Steps) -> None:
+def _convert_runs(steps: _Steps) -> None:
     """Convert every run of logs; all that fail are reported at once."""
     entries = steps.opened.project.convert
     config = steps.opened.given_config()
@@ -153,33 +153,36 @@ def _convert(steps: _Steps) -> None:
     for entry in entries:
         try:
             product = _run_product(steps, entry, config)
-            made += steps.bring(product, partial(_write_run, steps, entry, config))
+            made += steps.make_if_changed(product, partial(_convert_run, steps, entry, config))
         except InputError as error:
             failures.append(error)
     if failures:
-        raise _unconverted(failures, len(entries), steps.opened)
+        raise _conversion_error(failures, len(entries), steps.opened)
     if entries:
         steps.call.said("convert", f"{made} converted, {len(entries) - made} up to date")
 
 
 def _run_product(steps: _Steps, entry: ConvertEntry, config: Configuration) -> Product:
+    """The converted run of an entry, with the settings that decide it."""
     logs = [named_from(log.absolute(), steps.opened.folder.absolute()) for log in logs_of(steps.opened, entry)]
     settings = digest_over(entry, config.ingest, config.fix_sigma, logs)
     return Product(f"run {entry.to}", Path(steps.opened.place(entry.to)), settings)
 
 
-def _write_run(steps: _Steps, entry: ConvertEntry, config: Configuration) -> list[Path]:
+def _convert_run(steps: _Steps, entry: ConvertEntry, config: Configuration) -> list[Path]:
+    """Convert the logs of an entry and write the run; returns its files."""
     logs = sum(len(log.files) for log in entry.logs)
     steps.call.said("convert", f"{entry.run_id}: {logs} {'log' if logs == 1 else 'logs'}")
-    converted = run_of_logs(steps.opened, entry, config.ingest, config.fix_sigma, steps.recordings)
+    converted = convert_entry(steps.opened, entry, config.ingest, config.fix_sigma, steps.recordings)
     for reason, count in sorted(converted.dropped.items()):
-        steps.call.said("convert", f"{entry.run_id}: {said_of(reason)}: {count} x {reason}")
+        steps.call.said("convert", f"{entry.run_id}: {words_for_dropped(reason)}: {count} x {reason}")
     place = Path(steps.opened.place(entry.to))
     steps.recordings.write(converted.run, place)
     return [place] if place.is_file() else sorted(place.glob("*.parquet"))
 
 
-def _unconverted(failures: Sequence[InputError], of: int, opened: Opened) -> InputError:
+def _conversion_error(failures: Sequence[InputError], of: int, opened: OpenedProject) -> InputError:
+    """One error for all runs that cannot be converted."""
     if of == 1:
         return failures[0]
     return InputError(
@@ -191,22 +194,24 @@ def _unconverted(failures: Sequence[InputError], of: int, opened: Opened) -> Inp
     )
 
 
-def _make_site(steps: _Steps) -> None:
+def _make_site_if_changed(steps: _Steps) -> None:
+    """Make the site of the project's survey where anything of it changed."""
     entry = steps.opened.project.track
     if entry is None:
         return
     config = steps.opened.given_config()
     vehicle = steps.opened.given_vehicle()
-    wish = wish_for(steps.opened, entry)
+    wish = requested_site(steps.opened, entry)
     sources = [*wish.surveys, *([wish.balise_list] if wish.balise_list else [])]
-    _require_there(sources, steps.opened)
+    _require_sources(sources, steps.opened)
     site = Path(steps.opened.place(steps.opened.project.site))
     product = Product(f"site {steps.opened.project.site}", site, digest_over(entry, vehicle, config))
-    if not steps.bring(product, lambda: _write_site(steps, wish, site, vehicle, config)):
+    if not steps.make_if_changed(product, lambda: _make_site(steps, wish, site, vehicle, config)):
         steps.call.said("site", "up to date")
 
 
-def _require_there(sources: Sequence[Path], opened: Opened) -> None:
+def _require_sources(sources: Sequence[Path], opened: OpenedProject) -> None:
+    """Refuse surveys and lists that are not there."""
     for source in sources:
         if not source.exists():
             raise UsageError(
@@ -217,10 +222,11 @@ def _require_there(sources: Sequence[Path], opened: Opened) -> None:
             )
 
 
-def _write_site(steps: _Steps, wish: Wish, site: Path, vehicle: Vehicle, config: Configuration) -> list[Path]:
+def _make_site(steps: _Steps, wish: SiteRequest, site: Path, vehicle: Vehicle, config: Configuration) -> list[Path]:
+    """Make the site, write it with its page and findings; returns the files."""
     steps.call.said("site", f"made of {', '.join(path.name for path in wish.surveys)}")
     made = make_site(wish, vehicle, config)
-    write_made(made, site_page(site.resolve().name, made), site, True)
+    write_site(made, site_page(site.resolve().name, made), site, True)
     for line in summarise_findings(made.findings, f"{site / 'findings.csv'}"):
         steps.call.said("site", line)
     count = len(made.findings)
@@ -229,18 +235,19 @@ def _write_site(steps: _Steps, wish: Wish, site: Path, vehicle: Vehicle, config:
     return [site / name for name in names if (site / name).exists()]
 
 
-def wish_for(opened: Opened, entry: TrackEntry) -> Wish:
+def requested_site(opened: OpenedProject, entry: TrackEntry) -> SiteRequest:
     """The site that is asked for, with places as seen from here."""
     balises = entry.balises
     if balises is not None and not balises.startswith("every"):
         balises = opened.place(balises)
     surveys = [Path(opened.place(named)) for named in entry.survey]
-    return wish_of(
+    return site_request(
         surveys, balises, entry.epsg, entry.join_m, entry.flat, entry.direction, entry.id_field, entry.sigma_m
     )
 
 
-def _calibrate(steps: _Steps) -> None:
+def _calibrate_if_changed(steps: _Steps) -> None:
+    """Measure vehicle and noise where their runs or settings changed."""
     entry = steps.opened.project.calibrate
     if entry is None:
         return
@@ -249,14 +256,15 @@ def _calibrate(steps: _Steps) -> None:
     runs = find_runs(map(steps.opened.place, entry.runs))
     settings = digest_over(entry, vehicle, config, list(runs))
     product = Product("calibration", steps.opened.folder / RECORD / MEASURED_VEHICLE, settings)
-    measured = steps.bring(product, lambda: _measure(steps, entry, runs, config, vehicle))
+    measured = steps.make_if_changed(product, lambda: _calibrate(steps, entry, runs, config, vehicle))
     if not measured:
         steps.call.said("calibrate", "up to date")
 
 
-def _measure(
+def _calibrate(
     steps: _Steps, entry: CalibrateEntry, runs: dict[str, str], config: Configuration, vehicle: Vehicle
 ) -> list[Path]:
+    """Measure vehicle and noise on these runs and write both files; returns them."""
     from pipeline.studies.calibration.calibrate import calibrate  # replays, which most projects do not ask for
 
     steps.call.said("calibrate", f"on {len(runs)} runs")
@@ -273,7 +281,7 @@ def _measure(
     return files
 
 
-def _calibrated(steps: _Steps, plan: Plan) -> Plan:
+def _with_calibration(steps: _Steps, plan: Plan) -> Plan:
     """Vehicle and noise of each run from others, where `[replay]` asks for it."""
     asked = steps.opened.project.replay.calibrate
     if not asked:
@@ -284,14 +292,14 @@ def _calibrated(steps: _Steps, plan: Plan) -> Plan:
     return calibrated(plan, [one if one == AUTO else steps.opened.place(one) for one in asked], steps.call.jobs)
 
 
-def _only_these(plan: Plan, call: Call) -> None:
+def _refuse_other_results(plan: Plan, call: CallOptions) -> None:
     """Refuse, or remove, results of runs that the project does not name: they would count in its figures."""
     named = {job.run_id for job in plan.jobs}
-    others = _others(plan.out, named)
+    others = _other_runs(plan.out, named)
     if others and call.prune:
         remove_runs(plan.out, others)
         call.said("replay", f"removed the results of {', '.join(others)}")
-        others = _others(plan.out, named)
+        others = _other_runs(plan.out, named)
     if others:
         raise UsageError(
             "holds results of runs that the project does not name, and they would count in its figures",
@@ -301,11 +309,13 @@ def _only_these(plan: Plan, call: Call) -> None:
         )
 
 
-def _others(out: str, named: set[str]) -> list[str]:
+def _other_runs(out: str, named: set[str]) -> list[str]:
+    """Runs of a result that are not among these."""
     return sorted(set(store.run_ids(out)) - named)
 
 
-def _report(steps: _Steps, plan: Plan) -> Path | None:
+def _write_report(steps: _Steps, plan: Plan) -> Path | None:
+    """Write the report of the results; the first page, None for results that are not on this machine."""
     if is_url(plan.out):
         steps.call.said("report", "none: pages are written for results on this machine")
         return None

@@ -14,12 +14,12 @@ import polars as pl
 import tomli_w
 
 from pipeline.make.survey.make import make_site
-from pipeline.project.convert import Recordings, run_of_logs
+from pipeline.project.convert import Recordings, convert_entry
 from pipeline.project.found import Kind, is_one_log, is_prose, is_site, logs_below, look_around, require_name
 from pipeline.project.looking import InspectedLog, look_at, look_at_dates
-from pipeline.project.opened import Opened, named_from
+from pipeline.project.opened import OpenedProject, named_from
 from pipeline.project.recorded_runs import RecordedRun, group_into_runs, stem_of
-from pipeline.project.run import wish_for
+from pipeline.project.run import requested_site
 from pipeline.read.ingest import read_run
 from pipeline.read.ingest.correct import corrected_further
 from pipeline.read.ingest.parts import LogPart, lines_of_parts
@@ -58,6 +58,8 @@ class Wanted:
 
 @frozen
 class Proposal:
+    """Corrections that would make the streams of one run fit, and what was found."""
+
     run_id: str
     found: tuple[str, ...]
     corrections: tuple[StreamCorrection, ...]
@@ -68,7 +70,7 @@ class Proposal:
 class Drafted:
     """A project to be written, and what there is to say of it."""
 
-    opened: Opened
+    opened: OpenedProject
     logs: pl.DataFrame
     proposals: list[Proposal] = field(default_factory=list)
     remarks: list[str] = field(default_factory=list)
@@ -86,10 +88,10 @@ def draft_project(wanted: Wanted, folder: Path, recordings: Recordings, accept: 
     Raises `InputError` for a log that was named and cannot be read, `SiteError` or `UsageError` for the line.
     """
     folder = folder.absolute()
-    base = _base(wanted, folder)
+    base = _project_without_runs(wanted, folder)
     remarks: list[str] = []
-    logs, unread = _looked_at(wanted, base.given_config().ingest, recordings, remarks)
-    remarks += _passed_over(wanted)
+    logs, unread = _look_at_logs(wanted, base.given_config().ingest, recordings, remarks)
+    remarks += _ignored_files(wanted)
     remarks += [f"{log.path.name}: {text}" for log in logs for text in log.assumed]
     recorded_runs, alone = group_into_runs(logs, [path.absolute() for path in wanted.references])
     if not recorded_runs and logs:
@@ -100,12 +102,12 @@ def draft_project(wanted: Wanted, folder: Path, recordings: Recordings, accept: 
             expected="GNSS",
             remedy=" ".join(remarks) or None,
         )
-    remarks += [_unused(log) for log in alone]
+    remarks += [_unused_words(log) for log in alone]
     parts = tuple(part for log in logs for part in log.parts)
-    drafted = Drafted(base, _table_of(recorded_runs), [], remarks + lines_of_parts(parts), parts)
-    drafted.remarks += _without_odometer(recorded_runs)
-    drafted.remarks += [note for recorded_run in recorded_runs for note in _notes_of(recorded_run)]
-    site = _site(base)
+    drafted = Drafted(base, _rides_table(recorded_runs), [], remarks + lines_of_parts(parts), parts)
+    drafted.remarks += _remark_on_odometers(recorded_runs)
+    drafted.remarks += [note for recorded_run in recorded_runs for note in _receiver_remarks(recorded_run)]
+    site = _provisional_site(base)
     if site is not None:
         listed = "`balise inspect` of the site lists them"
         drafted.remarks += summarise_findings(ambiguities(site, base.given_config()), listed)
@@ -113,24 +115,25 @@ def draft_project(wanted: Wanted, folder: Path, recordings: Recordings, accept: 
     ready = []
     of_odometers: dict[str, Sequence[str]] = {}
     for recorded_run in recorded_runs:
-        proposal, entry, report = _checked(recorded_run, base, site, recordings, wanted.day, accept)
+        proposal, entry, report = _check_fit(recorded_run, base, site, recordings, wanted.day, accept)
         of_odometers[recorded_run.run_id] = report.of_odometers()
         drafted.proposals += [proposal] if proposal else []
         if recorded_run.is_ready and proposal is None:
             ready.append(named_from(recorded_run.logs[0].path, folder))
         else:
             entries.append(entry)
-    drafted.remarks += _of_all(of_odometers)
+    drafted.remarks += _unique(of_odometers)
     own = {"convert": tuple(entries), "replay": ReplayEntry(runs=tuple(ready))}
     own["unread"] = tuple(named_from(path, folder) for path in unread)
-    drafted.opened = Opened(base.file, base.project.model_copy(update=own))
+    drafted.opened = OpenedProject(base.file, base.project.model_copy(update=own))
     return drafted
 
 
-def _base(wanted: Wanted, folder: Path) -> Opened:
+def _project_without_runs(wanted: Wanted, folder: Path) -> OpenedProject:
     """The project without its runs."""
 
     def named(path: Path) -> str:
+        """A path as the project names it."""
         return named_from(path.absolute(), folder)
 
     settings = {"vehicle": wanted.vehicle, "config": wanted.config}
@@ -156,10 +159,10 @@ def _base(wanted: Wanted, folder: Path) -> Opened:
                 raise UsageError("does not exist", place=f"--balises {balises}", expected="a table, or `every 1000`")
             balises = named(Path(balises))
         given["track"] = TrackEntry(survey=tuple(map(named, wanted.track)), balises=balises)
-    return Opened(folder / FILE_NAME, Project(**given))
+    return OpenedProject(folder / FILE_NAME, Project(**given))
 
 
-def _looked_at(
+def _look_at_logs(
     wanted: Wanted, config: IngestConfig, recordings: Recordings, remarks: list[str]
 ) -> tuple[list[InspectedLog], list[Path]]:
     """Every log that was named, and of folders those that can be read; then files of folders that may be logs."""
@@ -191,7 +194,7 @@ def _named_logs(wanted: Wanted) -> dict[Path, tuple[Path, bool]]:
     """Each log by its place, as named or found in a folder; and whether one that cannot be read is an error."""
     surveys = {path.absolute() for path in wanted.track} | {Path(wanted.balises or "").absolute()}
     named: dict[Path, tuple[Path, bool]] = {}
-    for raw in [*_expanded(wanted.raws), *_expanded(wanted.references)]:
+    for raw in [*_resolve_patterns(wanted.raws), *_resolve_patterns(wanted.references)]:
         is_log = is_one_log(raw)
         for path in [raw] if is_log else logs_below(raw):
             if path.absolute() not in surveys:
@@ -211,11 +214,11 @@ _TAKEN_FOR: Mapping[Kind, str] = {
 _OF_A_RIDE = "; of positions of a ride make a CSV of time, latitude and longitude"
 
 
-def _passed_over(wanted: Wanted) -> list[str]:
+def _ignored_files(wanted: Wanted) -> list[str]:
     """What lies in folders of logs, is no log by its kind, and is named nowhere else."""
     own = [wanted.vehicle, wanted.config, *wanted.track, *([Path(wanted.balises)] if wanted.balises else [])]
     named = {path.absolute() for path in own if path is not None}
-    folders = [raw for raw in _expanded(wanted.raws) if raw.is_dir() and not is_one_log(raw)]
+    folders = [raw for raw in _resolve_patterns(wanted.raws) if raw.is_dir() and not is_one_log(raw)]
     found = [(kind, path) for folder in folders for kind, paths in look_around(folder).items() for path in paths]
     return [
         f"not used: {path}: taken for {_TAKEN_FOR[kind]}" + (_OF_A_RIDE if kind == "surveys" else "")
@@ -224,7 +227,7 @@ def _passed_over(wanted: Wanted) -> list[str]:
     ]
 
 
-def _expanded(raws: Sequence[Path]) -> list[Path]:
+def _resolve_patterns(raws: Sequence[Path]) -> list[Path]:
     """The files and folders that were named; patterns too, which not every shell resolves."""
     found: list[Path] = []
     for raw in raws:
@@ -238,14 +241,16 @@ def _expanded(raws: Sequence[Path]) -> list[Path]:
     return found
 
 
-def _unused(log: InspectedLog) -> str:
+def _unused_words(log: InspectedLog) -> str:
+    """A remark on a log that belongs to no ride."""
     streams = ", ".join(log.spans)
     return (
         f"not used: {log.path}: {streams} from {log.start:%Y-%m-%d %H:%M:%S} to {log.end:%H:%M:%S}, in no ride's time"
     )
 
 
-def _without_odometer(recorded_runs: Sequence[RecordedRun]) -> list[str]:
+def _remark_on_odometers(recorded_runs: Sequence[RecordedRun]) -> list[str]:
+    """A remark on rides without an odometer; nothing where all have one."""
     bare = [
         recorded_run.run_id
         for recorded_run in recorded_runs
@@ -255,10 +260,13 @@ def _without_odometer(recorded_runs: Sequence[RecordedRun]) -> list[str]:
     return [f"{which}; nothing is monitored along the track"] if bare else []
 
 
-def _notes_of(recorded_run: RecordedRun) -> list[str]:
+def _receiver_remarks(recorded_run: RecordedRun) -> list[str]:
+    """Remarks on a ride with several receivers: their names, and which could be the truth."""
     if len(recorded_run.receivers) < 2:
         return []
-    names = ", ".join(f"{files[0].path.name} ({_solution(recorded_run, files)})" for files in recorded_run.receivers)
+    names = ", ".join(
+        f"{files[0].path.name} ({_solution_name(recorded_run, files)})" for files in recorded_run.receivers
+    )
     fixed = [files[0].path for files in recorded_run.receivers if files[0].mostly_fixed and not recorded_run.references]
     return [
         f"{recorded_run.run_id}: receivers of the same time, each a solution of its own: {names}",
@@ -269,7 +277,7 @@ def _notes_of(recorded_run: RecordedRun) -> list[str]:
     ]
 
 
-def _solution(recorded_run: RecordedRun, files: Sequence[InspectedLog]) -> str:
+def _solution_name(recorded_run: RecordedRun, files: Sequence[InspectedLog]) -> str:
     """The first receiver is `primary`, others are named after their logs."""
     place = next(number for number, other in enumerate(recorded_run.receivers) if other is files)
     stems = [stem_of(others[0].path) for others in recorded_run.receivers]
@@ -278,10 +286,11 @@ def _solution(recorded_run: RecordedRun, files: Sequence[InspectedLog]) -> str:
     return stems[place] if stems.count(stems[place]) == 1 else f"{stems[place]}_{place + 1}"
 
 
-def _entry(recorded_run: RecordedRun, folder: Path, day: date | None) -> ConvertEntry:
+def _convert_entry(recorded_run: RecordedRun, folder: Path, day: date | None) -> ConvertEntry:
+    """The table of the project that converts a ride."""
     logs: list[dict[str, Any]] = []
     for files in recorded_run.receivers:
-        name = _solution(recorded_run, files)
+        name = _solution_name(recorded_run, files)
         # A log of several solutions has their names itself.
         own = {} if name == "primary" else {"solution": name}
         logs.append({"files": [log.path for log in files], **own, **files[0].mapping})
@@ -296,28 +305,33 @@ def _entry(recorded_run: RecordedRun, folder: Path, day: date | None) -> Convert
     return settings_from({"to": f"{home}/{recorded_run.run_id}", "logs": logs}, ConvertEntry, str(folder / FILE_NAME))
 
 
-def _checked(
-    recorded_run: RecordedRun, base: Opened, site: Site | None, recordings: Recordings, day: date | None, accept: Accept
+def _check_fit(
+    recorded_run: RecordedRun,
+    base: OpenedProject,
+    site: Site | None,
+    recordings: Recordings,
+    day: date | None,
+    accept: Accept,
 ) -> tuple[Proposal | None, ConvertEntry, FitReport]:
     """What mends a ride whose streams do not fit each other, the ride with it where that is accepted, and how it fits
     then.
     """
     config = base.given_config()
     vehicle = base.given_vehicle()
-    entry = _entry(recorded_run, base.folder, day)
+    entry = _convert_entry(recorded_run, base.folder, day)
     if recorded_run.is_ready:
         run = read_run(recorded_run.logs[0].path, config.ingest, with_digest=False)
     else:
-        run = run_of_logs(base, entry, config.ingest, config.fix_sigma, recordings).run
+        run = convert_entry(base, entry, config.ingest, config.fix_sigma, recordings).run
     corrections: list[StreamCorrection] = []
     found: list[str] = []
     for _ in range(_ROUNDS):
         report = fit_report(run, config, site, vehicle)
-        proposed = _corrections_of(report)
+        proposed = _proposed_corrections(report)
         if not proposed:
             break
-        fresh, log = _by_recorder(proposed, recorded_run, report)
-        sentences = _sentences(report)
+        fresh, log = _correct_recorder(proposed, recorded_run, report)
+        sentences = _misfit_words(report)
         if log is not None:
             mine = say("misfit_places", "rather_in_stream", log.path.name, "GNSS")
             sentences = [text.replace(say("misfit_places", "in_stream", "GNSS"), mine) for text in sentences]
@@ -331,7 +345,7 @@ def _checked(
     return proposal, entry.model_copy(update={"correct": tuple(corrections)}) if accepted else entry, report
 
 
-def _of_all(said: Mapping[str, Sequence[str]]) -> list[str]:
+def _unique(said: Mapping[str, Sequence[str]]) -> list[str]:
     """The same sentence of many runs once."""
     runs: dict[str, list[str]] = {}
     for run_id, sentences in said.items():
@@ -346,13 +360,14 @@ def correction_lines(corrections: Sequence[StreamCorrection]) -> list[str]:
     return [line for table in tables for line in ("[[convert.correct]]", *table.splitlines())]
 
 
-def _corrections_of(report: FitReport) -> list[StreamCorrection]:
+def _proposed_corrections(report: FitReport) -> list[StreamCorrection]:
+    """Corrections of the configuration that a report on the fit of the streams proposes."""
     lines = report.mending.get(CONFIGURATION, "")
     ingest = toml_of(lines.encode(), "lines that mend it").get("ingest")
     return list(settings_from(ingest, IngestConfig, "lines that mend it").correct) if isinstance(ingest, dict) else []
 
 
-def _by_recorder(
+def _correct_recorder(
     proposed: list[StreamCorrection], recorded_run: RecordedRun, report: FitReport
 ) -> tuple[list[StreamCorrection], InspectedLog | None]:
     """The same for all streams of one log, which have one clock; and that log, where its clock and not the GNSS's is
@@ -372,39 +387,43 @@ def _by_recorder(
         and not recorded_run.references
     ):
         kept = [one for one in proposed if one.stream not in ("gnss", "satellites")]
-        return [*kept, *(_shifted(name, -shift_s) for name in log.spans)], log
+        return [*kept, *(_clock_correction(name, -shift_s) for name in log.spans)], log
     shifts = [one.shift_s for one in proposed if one.shift_s and one.stream in log.spans]
     named = [one.stream for one in proposed]
     unchecked = [name for name in log.spans if name not in named and not _clock_fits(report, name)]
-    return [*proposed, *(_shifted(name, shift_s) for shift_s in shifts for name in unchecked)], None
+    return [*proposed, *(_clock_correction(name, shift_s) for shift_s in shifts for name in unchecked)], None
 
 
-def _shifted(stream: str, shift_s: float) -> StreamCorrection:
+def _clock_correction(stream: str, shift_s: float) -> StreamCorrection:
+    """A correction of the clock of one stream."""
     return StreamCorrection.model_validate({"stream": stream, "shift_s": shift_s})
 
 
 def _clock_fits(report: FitReport, stream: Stream) -> bool:
+    """Whether the report says that the clock of a stream fits that of the GNSS."""
     what = f"clock of the {stream.replace('_', ' ')} against the GNSS"
     states = report.tables["Fit"].filter(pl.col("check") == what)["state"]
     return states.head(1).to_list() == [FitState.FITS.value]
 
 
-def _sentences(report: FitReport) -> list[str]:
+def _misfit_words(report: FitReport) -> list[str]:
+    """What does not fit, in sentences."""
     states = (FitState.MISFIT.value, FitState.IMPOSSIBLE.value)
     rows = report.tables["Fit"].filter(pl.col("state").is_in(states)).iter_rows(named=True)
     return [f"{row['check']}: {row['found']}" + (f" ({row['cause']})" if row["cause"] else "") for row in rows]
 
 
-def _site(base: Opened) -> Site | None:
+def _provisional_site(base: OpenedProject) -> Site | None:
     """The line as far as it is known: made here to be looked at, not written."""
     config = base.given_config()
     if base.project.track is not None:
-        return make_site(wish_for(base, base.project.track), base.given_vehicle(), config)
+        return make_site(requested_site(base, base.project.track), base.given_vehicle(), config)
     named = base.place(base.project.site)
     return read_site(named, config.site) if Path(named).exists() else None
 
 
-def _table_of(recorded_runs: Sequence[RecordedRun]) -> pl.DataFrame:
+def _rides_table(recorded_runs: Sequence[RecordedRun]) -> pl.DataFrame:
+    """Rides as a table: each log with the streams that it feeds, and their times."""
     columns = ("run_id", "log", "feeds", "rows", "from", "to")
     rows = []
     for recorded_run in recorded_runs:

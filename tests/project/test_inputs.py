@@ -21,11 +21,11 @@ import polars as pl
 import pytest
 
 from datasets.recordings import recordings
-from pipeline.make.survey.make import make_site, wish_of
+from pipeline.make.survey.make import make_site, site_request
 from pipeline.make.survey.sources import read_surveys
-from pipeline.project.convert import logs_of, run_of_logs
+from pipeline.project.convert import convert_entry, logs_of
 from pipeline.project.made import Product, Record
-from pipeline.project.opened import Opened
+from pipeline.project.opened import OpenedProject
 from pipeline.storage.noted import noting
 from schemas.config import Configuration, Vehicle
 from schemas.errors import BaliseError
@@ -62,18 +62,18 @@ def heard() -> Iterator[list[Path]]:
 
 
 def survey(*paths: Path, balises: Path | None = None) -> Reading:
-    wish = wish_of(list(paths), None if balises is None else str(balises), None, None, False)
+    wish = site_request(list(paths), None if balises is None else str(balises), None, None, False)
     return lambda: make_site(wish, Vehicle(), Configuration())
 
 
 def logs(folder: Path, *named: str, **mapping: object) -> Reading:
     """The run of these logs, as a project in this folder converts it."""
     table = {"to": "made/run", "logs": [{"files": list(named), **mapping}]}
-    opened = Opened(folder / "balise.toml", Project.model_validate({"convert": [table]}))
+    opened = OpenedProject(folder / "balise.toml", Project.model_validate({"convert": [table]}))
     (entry,) = opened.project.convert
     config = Configuration()
     assert logs_of(opened, entry)
-    return lambda: run_of_logs(opened, entry, config.ingest, config.fix_sigma, recordings())
+    return lambda: convert_entry(opened, entry, config.ingest, config.fix_sigma, recordings())
 
 
 def geojson(folder: Path, trial: SmallTrial) -> Reading:
@@ -206,7 +206,7 @@ def step(tmp_path: Path) -> Callable[[Reading], bool]:
             return [made]
 
         with contextlib.suppress(BaliseError):  # what was changed may not be readable any more
-            Record(tmp_path).bring(Product("it", made, "settings"), make)
+            Record(tmp_path).make_if_changed(Product("it", made, "settings"), make)
         return bool(begun)
 
     return bring

@@ -17,9 +17,9 @@ import pyarrow.parquet as pq
 import pytest
 
 import cli
-from pipeline.project.convert import run_of_logs
+from pipeline.project.convert import convert_entry
 from pipeline.project.made import Product, Record
-from pipeline.project.opened import Opened
+from pipeline.project.opened import OpenedProject
 from schemas.enums import Remedy
 from schemas.errors import InputError, UsageError
 from schemas.project import Project
@@ -180,16 +180,16 @@ def test_killed_before_it_is_noted_a_product_is_made_again(tmp_path: Path, known
         return making
 
     if known:
-        Record(tmp_path).bring(Product("run a", made, "old"), make(b"old"))
+        Record(tmp_path).make_if_changed(Product("run a", made, "old"), make(b"old"))
     with pytest.raises(Killed):
-        Record(tmp_path).bring(Product("run a", made, "new"), make(b"ha", Killed()))
-    assert Record(tmp_path).bring(Product("run a", made, "new"), make(b"half")).made
-    assert not Record(tmp_path).bring(Product("run a", made, "new"), make(b"no")).made
+        Record(tmp_path).make_if_changed(Product("run a", made, "new"), make(b"ha", Killed()))
+    assert Record(tmp_path).make_if_changed(Product("run a", made, "new"), make(b"half")).made
+    assert not Record(tmp_path).make_if_changed(Product("run a", made, "new"), make(b"no")).made
     with pytest.raises(InputError):
-        Record(tmp_path).bring(Product("run a", made, "third"), make(b"", InputError("damaged", place="log")))
+        Record(tmp_path).make_if_changed(Product("run a", made, "third"), make(b"", InputError("damaged", place="log")))
     made.write_bytes(b"by hand")
     with pytest.raises(UsageError, match="was changed"):
-        Record(tmp_path).bring(Product("run a", made, "third"), make(b"no"))
+        Record(tmp_path).make_if_changed(Product("run a", made, "third"), make(b"no"))
     assert made.read_bytes() == b"by hand"
 
 
@@ -201,12 +201,12 @@ def test_a_file_that_was_added_to_a_run_is_not_removed(tmp_path: Path) -> None:
         (run / "gnss.parquet").write_bytes(b"made")
         return [run / "gnss.parquet"]
 
-    Record(tmp_path).bring(Product("run a", run, "old"), make)
+    Record(tmp_path).make_if_changed(Product("run a", run, "old"), make)
     (run / "reference.parquet").write_bytes(b"added")
-    assert not Record(tmp_path).bring(Product("run a", run, "old"), make).made
+    assert not Record(tmp_path).make_if_changed(Product("run a", run, "old"), make).made
     with pytest.raises(UsageError, match="was added"):
-        Record(tmp_path).bring(Product("run a", run, "new"), make)
-    assert Record(tmp_path, force=True).bring(Product("run a", run, "new"), make).made
+        Record(tmp_path).make_if_changed(Product("run a", run, "new"), make)
+    assert Record(tmp_path, force=True).make_if_changed(Product("run a", run, "new"), make).made
 
 
 def test_unknown_keys_are_refused(project: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -256,7 +256,7 @@ def test_an_interrupted_conversion_goes_on(project: Path, monkeypatch: pytest.Mo
         converted.append(entry.run_id)
         if converted == ["one", "two"]:
             os.kill(os.getpid(), signal.SIGINT)
-        return run_of_logs(opened, entry, *others)
+        return convert_entry(opened, entry, *others)
 
     monkeypatch.setattr("pipeline.project.run.run_of_logs", interrupted)
     assert call("run", "-q") == 128 + signal.SIGINT
@@ -275,7 +275,7 @@ def test_a_run_is_exported_and_remedies_name_the_file(project: Path, capsys: pyt
 
 
 def test_remedies_of_a_project_name_its_keys() -> None:
-    places = Opened(Path("week12/balise.toml"), Project()).words
+    places = OpenedProject(Path("week12/balise.toml"), Project()).message_words
     words = remedy_words(Remedy.CALIBRATE, **places)
     assert "week12/balise.toml" in words
     assert words.endswith("`balise run --project week12`")

@@ -174,8 +174,8 @@ def test_nobody_but_a_person_accepts_that_positions_are_moved(
 ) -> None:
     """Another datum, or a receiver that is wrong by as much: the survey alone cannot tell."""
     moved = StreamCorrection(stream="gnss", shift_east_m=40.0)
-    monkeypatch.setattr("pipeline.project.trial._by_recorder", lambda *_: ([moved], None))
-    monkeypatch.setattr("pipeline.project.trial._corrections_of", lambda _: [moved])
+    monkeypatch.setattr("pipeline.project.trial._correct_recorder", lambda *_: ([moved], None))
+    monkeypatch.setattr("pipeline.project.trial._proposed_corrections", lambda _: [moved])
     assert call("trial", "raw", "--track", "line.gpx", "--json", "--to", "week12", "--accept-corrections") == 0
     (proposed,) = json.loads(capsys.readouterr().out)["corrections"]
     assert proposed["accepted"] is False

@@ -12,6 +12,14 @@ Touches files. Damaged messages are counted and left out, never guessed.
 """
 
 from pipeline.make.receivers.adding import Purpose
-from pipeline.make.receivers.convert import Converted, Gatherings, as_run, convert, extended, gather, said_of
+from pipeline.make.receivers.convert import (
+    Converted,
+    Gatherings,
+    as_run,
+    convert,
+    extend_run,
+    gather,
+    words_for_dropped,
+)
 
-__all__ = ["Converted", "Gatherings", "Purpose", "as_run", "convert", "extended", "gather", "said_of"]
+__all__ = ["Converted", "Gatherings", "Purpose", "as_run", "convert", "extend_run", "gather", "words_for_dropped"]

@@ -25,12 +25,12 @@ class Purpose:
     stream: Literal["gnss", "reference"] = "gnss"
 
 
-def assigned(streams: Streams, purpose: Purpose, sigmas: FixSigma) -> Streams:
+def assign_purpose(streams: Streams, purpose: Purpose, sigmas: FixSigma) -> Streams:
     """The streams as they are meant; raises `UsageError` where one name would cover several receivers."""
     if purpose.solution is not None and not purpose.solution.strip():
         raise UsageError("is empty", place="--solution", expected="a name for the receiver")
     if purpose.stream == "reference":
-        return {name: frame for name, frame in streams.items() if name not in BY_SOLUTION} | _reference(
+        return {name: frame for name, frame in streams.items() if name not in BY_SOLUTION} | _as_reference(
             streams, purpose, sigmas
         )
     if purpose.solution is None or "gnss" not in streams:
@@ -52,8 +52,8 @@ def assigned(streams: Streams, purpose: Purpose, sigmas: FixSigma) -> Streams:
     return streams | named
 
 
-def _reference(streams: Streams, purpose: Purpose, sigmas: FixSigma) -> Streams:
-    """The positions as truth. A receiver that tells no accuracy has that of its kind of fix: it is not exact."""
+def _as_reference(streams: Streams, purpose: Purpose, sigmas: FixSigma) -> Streams:
+    """The positions as the stream `reference`; a receiver that states no accuracy has that of its kind of fix."""
     if "gnss" not in streams:
         return {}
     fixes = (
@@ -75,12 +75,12 @@ def _reference(streams: Streams, purpose: Purpose, sigmas: FixSigma) -> Streams:
     return {"reference": fixes.select(*columns, sigma_m=pl.coalesce(stated, table))}
 
 
-def added(run: RunLog, streams: Streams, force: bool, place: Path) -> RunLog:
+def add_streams(run: RunLog, streams: Streams, force: bool, place: Path) -> RunLog:
     """The run with these streams as well. `force`: in place of those that it has.
 
     Raises `UsageError` where it has one of them already, `InputError` where they are of another time.
     """
-    _refuse_what_is_lost(run, place)
+    _refuse_partial_run(run, place)
     merged: Streams = {}
     for name in STREAMS:
         new = streams.get(name)
@@ -120,8 +120,8 @@ def _refuse_other_times(run: RunLog, name: Stream, new: pl.DataFrame, place: Pat
         )
 
 
-def _refuse_what_is_lost(run: RunLog, place: Path) -> None:
-    """A run is written anew with all its streams: what reading left out would be gone."""
+def _refuse_partial_run(run: RunLog, place: Path) -> None:
+    """Refuse a run of which reading left something out: written anew with all its streams, that would be gone."""
     lost = run.notes.skipped_topics
     if lost:
         raise UsageError(

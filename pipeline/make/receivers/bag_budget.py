@@ -9,7 +9,7 @@ from io import BytesIO
 from pathlib import Path
 from typing import Any
 
-from pipeline.make.receivers.unpack import opened_zstd
+from pipeline.make.receivers.unpack import open_zstd
 from pipeline.read.ingest.mcap_run import walk_log
 from pipeline.storage.budget import Budget
 from schemas.config import IngestConfig
@@ -27,7 +27,7 @@ def budget_of_bag(path: Path, config: IngestConfig) -> Budget:
             walk_log(file, config, _Nothing())
         elif file.suffix == ".zstd":
             budget = Budget(str(file), file.stat().st_size, config)
-            with opened_zstd(file) as packed, Path(os.devnull).open("wb") as nowhere:
+            with open_zstd(file) as packed, Path(os.devnull).open("wb") as nowhere:
                 budget.copy(packed, nowhere)
     return Budget(str(path), sum(file.stat().st_size for file in files), config)
 
@@ -36,7 +36,7 @@ class _Nothing:
     """Takes the messages of a log that is only walked."""
 
     def add(self, *_: Any) -> None:
-        pass
+        """Take a message, and do nothing with it."""
 
 
 def unpacker_of(bag: Any, place: str, config: IngestConfig) -> Unpack:
@@ -48,7 +48,7 @@ def unpacker_of(bag: Any, place: str, config: IngestConfig) -> Unpack:
         elif reader.storage.metadata.compression_mode == "message":
             reader.storage.metadata = reader.storage.metadata._replace(compression_mode=None)
             packed_messages = True
-    return _bounded(opened_zstd, place, config) if packed_messages else bytes
+    return _bounded_unpacker(open_zstd, place, config) if packed_messages else bytes
 
 
 def _bounded_chunk(chunk: Any, place: str, config: IngestConfig) -> Any:
@@ -57,14 +57,15 @@ def _bounded_chunk(chunk: Any, place: str, config: IngestConfig) -> Any:
 
     openers = {bz2.decompress: bz2.open, lz4.decompress: lz4.open}
     opener = openers.get(chunk.decompressor)
-    return chunk if opener is None else chunk._replace(decompressor=_bounded(opener, place, config))
+    return chunk if opener is None else chunk._replace(decompressor=_bounded_unpacker(opener, place, config))
 
 
-def _bounded(opener: Callable[[BytesIO], Any], place: str, config: IngestConfig) -> Unpack:
+def _bounded_unpacker(opener: Callable[[BytesIO], Any], place: str, config: IngestConfig) -> Unpack:
     """An unpacking that stops at the limit."""
     most = int(config.chunk_limit_mib * _MIB)
 
     def unpack(packed: bytes) -> bytes:
+        """Unpack a chunk or message; raises `InputError` beyond the limit."""
         with opener(BytesIO(packed)) as stream:
             content = stream.read(most + 1)
         if len(content) > most:

@@ -47,8 +47,8 @@ def read_bag(path: Path, config: IngestConfig, partly: bool = False) -> Bag:
     if path.suffix.lower() == ".mcap":
         census = Census()
         run = read_part([path], config, partly, [census])
-        return Bag(*_with_rest(run, {}), topics_in([census], config))
-    if path.is_dir() and (declared := declared_of(path)) is not None and declared.mcap:
+        return Bag(*_with_unused_noted(run, {}), topics_in([census], config))
+    if path.is_dir() and (declared := read_declaration(path)) is not None and declared.mcap:
         return _read_parts(path, declared, config, partly)
     with scratch_folder() as folder:
         log = folder / "bag.mcap"
@@ -56,7 +56,9 @@ def read_bag(path: Path, config: IngestConfig, partly: bool = False) -> Bag:
         census = Census()
         try:
             run = read_part([log], config, partly, [census])
-            return Bag(*_with_rest(_held_against(run, path, counts), left), topics_in([census], config))
+            return Bag(
+                *_with_unused_noted(_compared_with_declaration(run, path, counts), left), topics_in([census], config)
+            )
         except BaliseError as error:
             error.place = None if error.place is None else error.place.replace(str(log), str(path))
             error.message = error.message.replace(str(log), str(path))
@@ -71,15 +73,15 @@ def describe_bag(path: Path, config: IngestConfig) -> LogDescription:
         bag = read_bag(path, config)
         return description_of(str(path), "bag", size, bag.topics, bag.run, ())
     except BaliseError as error:
-        topics = _topics_alone(path, config)
+        topics = _topics_without_messages(path, config)
         return description_of(str(path), "bag", size, topics, None, (str(error),))
 
 
-def _topics_alone(path: Path, config: IngestConfig) -> tuple[TopicSummary, ...]:
-    """Topics of a bag, without its messages if that can be."""
+def _topics_without_messages(path: Path, config: IngestConfig) -> tuple[TopicSummary, ...]:
+    """Topics of a bag from its description, without reading its messages if that can be."""
     try:
-        if path.is_dir() and (declared := declared_of(path)) is not None and declared.mcap:
-            return topics_of(files_of(path, declared), config)
+        if path.is_dir() and (declared := read_declaration(path)) is not None and declared.mcap:
+            return topics_of(bag_files(path, declared), config)
         with scratch_folder() as folder:
             log = folder / "bag.mcap"
             _transcribe(path, log, config)
@@ -100,7 +102,7 @@ class Declared(NamedTuple):
     topics: dict[str, int]
 
 
-def declared_of(folder: Path) -> Declared | None:
+def read_declaration(folder: Path) -> Declared | None:
     """The declaration of a bag folder; None where there is none, or none that can be read."""
     try:
         from ruamel.yaml import YAML
@@ -121,7 +123,7 @@ def declared_of(folder: Path) -> Declared | None:
         return None
 
 
-def files_of(folder: Path, declared: Declared) -> list[Path]:
+def bag_files(folder: Path, declared: Declared) -> list[Path]:
     """The files of a bag folder that are there, in order.
 
     Raises `InputError` where none of them is there.
@@ -140,32 +142,32 @@ def files_of(folder: Path, declared: Declared) -> list[Path]:
 
 def _read_parts(folder: Path, declared: Declared, config: IngestConfig, partly: bool) -> Bag:
     """The MCAP files of a bag folder as one run; what is missing makes it partial."""
-    found = files_of(folder, declared)
+    found = bag_files(folder, declared)
     counted = [Census() for _ in found]
     run = read_part(found, config, partly, counted)
-    damages = [*filter(None, [run.notes.damage]), *_absent(folder, declared, found)]
-    damages += _fewer(declared, run.notes.messages)
+    damages = [*filter(None, [run.notes.damage]), *_missing_files(folder, declared, found)]
+    damages += _topics_with_fewer_messages(declared, run.notes.messages)
     whole = replace(run, notes=replace(run.notes, damage="; ".join(damages) or None))
-    return Bag(*_with_rest(whole, {}), topics_in(counted, config))
+    return Bag(*_with_unused_noted(whole, {}), topics_in(counted, config))
 
 
-def _absent(folder: Path, declared: Declared, found: Sequence[Path]) -> Iterator[str]:
+def _missing_files(folder: Path, declared: Declared, found: Sequence[Path]) -> Iterator[str]:
     """Files that are declared and not there, or hold nothing, and those that are there and not declared."""
     names = [path.name for path in found]
     for name in declared.files:
         if name not in names:
             yield f"{name} is declared and {'empty' if (folder / name).is_file() else 'not there'}"
-    yield from _undeclared(folder, declared)
+    yield from _undeclared_files(folder, declared)
 
 
-def _undeclared(folder: Path, declared: Declared) -> Iterator[str]:
+def _undeclared_files(folder: Path, declared: Declared) -> Iterator[str]:
     """Files next to a bag that its description does not name."""
     others = sorted(path.name for path in folder.iterdir() if path.suffix in (".mcap", ".db3"))
     known = {name.removesuffix(".zstd") for name in declared.files}
     yield from (f"{name} is not declared, and not read" for name in others if name not in known)
 
 
-def _fewer(declared: Declared, counts: Mapping[str, int]) -> Iterator[str]:
+def _topics_with_fewer_messages(declared: Declared, counts: Mapping[str, int]) -> Iterator[str]:
     """Topics of which fewer messages were found than are declared."""
     lost = {topic: wanted for topic, wanted in sorted(declared.topics.items()) if counts.get(topic, 0) < wanted}
     for topic, wanted in lost.items():
@@ -174,17 +176,19 @@ def _fewer(declared: Declared, counts: Mapping[str, int]) -> Iterator[str]:
         yield f"holds {sum(counts.values())} of {declared.messages} messages that are declared"
 
 
-def _with_rest(run: RunLog, left: dict[str, int]) -> tuple[RunLog, dict[str, int]]:
+def _with_unused_noted(run: RunLog, left: dict[str, int]) -> tuple[RunLog, dict[str, int]]:
     """A run with what was not used of its log."""
     if run.notes.damage is not None:
         left = left | {f"end of the log, {run.notes.damage}": 1}
     return run, left | {f"topic {topic}": 1 for topic in run.notes.skipped_topics}
 
 
-def _held_against(run: RunLog, path: Path, counts: Mapping[str, int]) -> RunLog:
-    """What the folder of a bag declares and its files lack makes the run partial."""
-    declared = declared_of(path) if path.is_dir() else None
-    damages = [] if declared is None else [*_undeclared(path, declared), *_fewer(declared, counts)]
+def _compared_with_declaration(run: RunLog, path: Path, counts: Mapping[str, int]) -> RunLog:
+    """The run, partial where its files lack what the folder of the bag declares."""
+    declared = read_declaration(path) if path.is_dir() else None
+    damages = (
+        [] if declared is None else [*_undeclared_files(path, declared), *_topics_with_fewer_messages(declared, counts)]
+    )
     if not damages:
         return run
     return replace(run, notes=replace(run.notes, damage="; ".join(damages)))
@@ -206,7 +210,7 @@ def _transcribe(path: Path, to: Path, config: IngestConfig) -> tuple[dict[str, i
         # Bags of ROS 1 always hold their definitions, older ones of ROS 2 never do.
         known = None if path.suffix.lower() == ".bag" else get_typestore(Stores.LATEST)
         with AnyReader([path], default_typestore=known) as bag:
-            return _write(bag, to, unpacker_of(bag, str(path), config), budget)
+            return _write_as_mcap(bag, to, unpacker_of(bag, str(path), config), budget)
     except BaliseError:
         raise
     except Exception as error:  # the reader's own errors share no base class
@@ -218,7 +222,7 @@ def _transcribe(path: Path, to: Path, config: IngestConfig) -> tuple[dict[str, i
         ) from None
 
 
-def _write(bag: Any, to: Path, unpack: Unpack, budget: Budget) -> tuple[dict[str, int], dict[str, int]]:
+def _write_as_mcap(bag: Any, to: Path, unpack: Unpack, budget: Budget) -> tuple[dict[str, int], dict[str, int]]:
     """Write all messages of a bag as MCAP."""
     from mcap.writer import CompressionType, Writer
 

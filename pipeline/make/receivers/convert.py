@@ -12,13 +12,13 @@ from pathlib import Path
 
 import polars as pl
 
-from pipeline.make.receivers.adding import BY_SOLUTION, Purpose, Streams, added, assigned
+from pipeline.make.receivers.adding import BY_SOLUTION, Purpose, Streams, add_streams, assign_purpose
 from pipeline.make.receivers.bags import is_bag, read_bag
-from pipeline.make.receivers.csv import TABLES, names_file, read_csv
-from pipeline.make.receivers.gpsd import is_gpsd, objects_in, read_gpsd
+from pipeline.make.receivers.csv import TABLES, maps_file, read_csv
+from pipeline.make.receivers.gpsd import count_objects, is_gpsd, read_gpsd
 from pipeline.make.receivers.messages import NoEpochError, UnknownError, read_messages, reasons_text
 from pipeline.make.receivers.rtklib import is_solution, parts_of_solution, read_solution
-from pipeline.make.receivers.unpack import BAG_FOLDER, unpacked
+from pipeline.make.receivers.unpack import BAG_FOLDER, unpacked_logs
 from pipeline.read.ingest.conform import conform, refuse
 from pipeline.read.ingest.correct import corrected, corrections_of
 from pipeline.read.ingest.mapping import mappings_of
@@ -44,9 +44,9 @@ class Converted:
         listed = dict.fromkeys([*self.run.notes.raw_logs, *((log.name, log.size_bytes, log.sha256) for log in logs)])
         return replace(self, run=replace(self.run, notes=replace(self.run.notes, raw_logs=tuple(listed))))
 
-    def gathered(self) -> Gatherings:
+    def as_gatherings(self) -> Gatherings:
         """The streams, and the corrections that they hold."""
-        return replace(gathered_of(self.run, self.dropped), parts=self.parts)
+        return replace(gatherings_of_run(self.run, self.dropped), parts=self.parts)
 
 
 def convert(logs: list[Path], run_id: str, config: IngestConfig | None = None) -> Converted:
@@ -88,7 +88,7 @@ def as_run(
     Raises:
         InputError: the logs hold no position.
     """
-    streams = assigned(logs.streams, purpose or Purpose(), sigmas or FixSigma())
+    streams = assign_purpose(logs.streams, purpose or Purpose(), sigmas or FixSigma())
     if "gnss" not in streams:
         raise InputError(
             "no epoch with a time and a position",
@@ -103,7 +103,7 @@ def as_run(
     return Converted(corrected(run, correct, later=True), logs.dropped, logs.parts)
 
 
-def extended(
+def extend_run(
     run: RunLog,
     place: Path,
     logs: Gatherings,
@@ -129,7 +129,7 @@ def extended(
     Raises:
         InputError: the run has a stream already, or its corrections differ.
     """
-    streams = assigned(logs.streams, purpose, sigmas)
+    streams = assign_purpose(logs.streams, purpose, sigmas)
     notes = IngestNotes(corrections=logs.corrections_as(purpose))
     bare = RunLog(run.run_id, run.gnss.clear(), notes=notes).with_streams(**streams)
     new = corrected(bare, [made for made in correct if made.stream in streams], later=True)
@@ -137,7 +137,7 @@ def extended(
     for name in streams.keys() & set(BY_SOLUTION):
         if old.stream(name) is not None:
             _refuse_unlike(corrections_of(old, name), corrections_of(new, name), name, place)
-    whole = added(old, {name: frame for name in streams if (frame := new.stream(name)) is not None}, force, place)
+    whole = add_streams(old, {name: frame for name in streams if (frame := new.stream(name)) is not None}, force, place)
     held = [made for name in STREAMS for made in corrections_of(new if name in streams else old, name)]
     damages = dict.fromkeys(filter(None, [old.notes.damage, logs.damage]))
     notes = replace(old.notes, corrections=tuple(held), damage="; ".join(damages) or None)
@@ -179,7 +179,7 @@ class Gatherings:
         return tuple(made for made in self.corrections if made.stream not in lost)
 
 
-def gathered_of(run: RunLog, dropped: Mapping[str, int]) -> Gatherings:
+def gatherings_of_run(run: RunLog, dropped: Mapping[str, int]) -> Gatherings:
     """The streams of a run, and the corrections that they hold."""
     streams: Streams = {name: frame for name in STREAMS if (frame := run.stream(name)) is not None}
     return Gatherings(streams, dropped, run.notes.corrections, run.notes.damage)
@@ -207,7 +207,7 @@ def gather(
     unread: list[NoEpochError | UnknownError] = []
     for log in logs:
         files.require_regular(log)
-        with unpacked(log, config or IngestConfig()) as inner:
+        with unpacked_logs(log, config or IngestConfig()) as inner:
             for plain in inner:
                 place = log if plain == log else log / plain.name
                 try:
@@ -218,36 +218,41 @@ def gather(
                         raise
                     error.place = str(error.place).replace(str(plain), str(place))
                     unread.append(error)
-    _refuse_unread(unread, parts)
-    _refuse_absent(parts, config or IngestConfig())
+    _refuse_unreadable(unread, parts)
+    _refuse_absent_topics(parts, config or IngestConfig())
     names = {NoEpochError: "log without an epoch", UnknownError: "file of an archive that is no log"}
     dropped.update(names[type(error)] for error in unread)
     _refuse_overlaps(parts)
     damages = [f"{log.name}: {gathered.damage}" for log, gathered in parts if gathered.damage is not None]
     listed = tuple(part for _, gathered in parts for part in gathered.parts)
-    return Gatherings(_concat_streams(parts), dict(dropped), _common(parts), "; ".join(damages) or None, listed)
+    return Gatherings(
+        _concat_streams(parts), dict(dropped), _common_corrections(parts), "; ".join(damages) or None, listed
+    )
 
 
-def _refuse_unread(unread: list[NoEpochError | UnknownError], parts: list[tuple[Path, Gatherings]]) -> None:
-    """Without any position a log of a receiver that holds none is the error; without any log, a file that is none."""
+def _refuse_unreadable(unread: list[NoEpochError | UnknownError], parts: list[tuple[Path, Gatherings]]) -> None:
+    """Refuse logs that hold no position, with the error of a receiver's log.
+
+    Without any log, that of a file that is none.
+    """
     found = any("gnss" in gathered.streams for _, gathered in parts)
     for error in unread:
         if not parts or (isinstance(error, NoEpochError) and not found):
             raise error
 
 
-def _refuse_absent(parts: list[tuple[Path, Gatherings]], config: IngestConfig) -> None:
-    """A topic that is mapped is in one of the bags, or its mapping is of a table."""
+def _refuse_absent_topics(parts: list[tuple[Path, Gatherings]], config: IngestConfig) -> None:
+    """Refuse mappings of topics that are in none of the bags, unless they are of a table."""
     bags = [(log, gathered.topics) for log, gathered in parts if gathered.topics]
     if not bags:
         return
     tables = {name for log, gathered in parts if not gathered.topics for name in (log.name, log.stem, "*")}
     held = {name for log, topics in bags for topic in topics for name in (topic, f"{log.name}:{topic}")}
-    refuse(absent_topics(held | tables, of_topics(config), ", ".join(str(log) for log, _ in bags)))
+    refuse(absent_topics(held | tables, mappings_of_topics(config), ", ".join(str(log) for log, _ in bags)))
 
 
-def _common(parts: list[tuple[Path, Gatherings]]) -> tuple[StreamCorrection, ...]:
-    """What the logs hold of corrections; logs of one stream hold the same."""
+def _common_corrections(parts: list[tuple[Path, Gatherings]]) -> tuple[StreamCorrection, ...]:
+    """Corrections that the logs hold; logs of one stream hold the same."""
     common: dict[Stream, list[StreamCorrection]] = {}
     for log, gathered in parts:
         for name in gathered.streams:
@@ -256,7 +261,7 @@ def _common(parts: list[tuple[Path, Gatherings]]) -> tuple[StreamCorrection, ...
     return tuple(correction for made in common.values() for correction in made)
 
 
-def said_of(reason: str) -> str:
+def words_for_dropped(reason: str) -> str:
     """What became of the records set apart for a reason: some are noted and used all the same.
 
     Args:
@@ -299,10 +304,10 @@ _RECORDERS: dict[Stream, tuple[str, tuple[str, ...], str, str]] = {
 
 
 def _refuse_overlaps(parts: list[tuple[Path, Gatherings]]) -> None:
-    """Two recorders under one name would be read as one that jumps between their values."""
+    """Refuse logs of one name whose times overlap: they would be read as one recorder that jumps between two."""
     for stream, (key, columns, values, remedy) in _RECORDERS.items():
         logs = [(log, gathered.streams[stream]) for log, gathered in parts if stream in gathered.streams]
-        spans = [span for log, frame in logs for span in _spans(log, frame, key, columns)]
+        spans = [span for log, frame in logs for span in _recorded_spans(log, frame, key, columns)]
         if len(spans) < 2:
             continue
         for (name, _), rows in pl.concat(spans).group_by(key, "column", maintain_order=True):
@@ -317,8 +322,8 @@ def _refuse_overlaps(parts: list[tuple[Path, Gatherings]]) -> None:
                     )
 
 
-def _spans(log: Path, frame: pl.DataFrame, key: str, columns: tuple[str, ...]) -> Iterator[pl.DataFrame]:
-    """Times from when to when a log holds values, by recorder; a frame for each of the columns."""
+def _recorded_spans(log: Path, frame: pl.DataFrame, key: str, columns: tuple[str, ...]) -> Iterator[pl.DataFrame]:
+    """Per recorder and column a frame of the begin and end of the times at which a log holds values."""
     named = frame if key in frame.columns else frame.with_columns(pl.lit("primary").alias(key))
     for column in columns or ("t",):
         if column in named.columns:
@@ -331,16 +336,16 @@ def _convert_one(log: Path, config: IngestConfig, date: date | None, solution: s
     """What one file of a receiver gives."""
     if is_bag(log):
         # Corrections are made of the whole, once.
-        own = of_topics(config, log)
+        own = mappings_of_topics(config, log)
         bag = read_bag(log, own.model_copy(update={"correct": ()}), partly=True)
-        gathered = gathered_of(bag.run, bag.left)
+        gathered = gatherings_of_run(bag.run, bag.left)
         return replace(
             gathered,
             streams={name: frame for name, frame in gathered.streams.items() if frame.height},
             parts=tuple(parts_of_topics(log.name, bag.topics, bag.run.notes.skipped_topics)),
             topics=tuple(topic.topic for topic in bag.topics),
         )
-    if log.suffix.lower() == ".csv" or names_file(config, log):
+    if log.suffix.lower() == ".csv" or maps_file(config, log):
         table = read_csv(log, config)
         return Gatherings(table.streams, table.left, parts=tuple(table.parts))
     if log.is_dir():
@@ -352,12 +357,12 @@ def _convert_one(log: Path, config: IngestConfig, date: date | None, solution: s
     if is_gpsd(content):
         streams, dropped = read_gpsd(content, log, solution)
         if streams["gnss"].height:
-            return Gatherings(streams, dropped, parts=tuple(parts_of_messages(log.name, objects_in(content))))
+            return Gatherings(streams, dropped, parts=tuple(parts_of_messages(log.name, count_objects(content))))
     found, left, parts = read_messages(content, log, date, solution)
     return Gatherings(found, left, parts=parts)
 
 
-def of_topics(config: IngestConfig, log: Path | None = None) -> IngestConfig:
+def mappings_of_topics(config: IngestConfig, log: Path | None = None) -> IngestConfig:
     """Without the mappings of tables, whose names are no topics of a bag; `LOG:TOPIC` of this log is its topic."""
     prefix = "" if log is None else f"{log.name}:"
     kept: dict[str, object] = {

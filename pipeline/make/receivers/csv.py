@@ -11,7 +11,7 @@ import dataframely as dy
 import numpy as np
 import polars as pl
 
-from pipeline.make.receivers.csv_times import instants, time_columns
+from pipeline.make.receivers.csv_times import parse_instants, time_columns
 from pipeline.read.ingest.conform import refuse
 from pipeline.read.ingest.csv_text import CUT_ROW, read_log_table, with_points
 from pipeline.read.ingest.mapping import mappings_of
@@ -39,8 +39,8 @@ _VALUES: dict[Stream, tuple[str, ...]] = {
 _FEWEST = 3  # positions that show a usual step
 
 
-def names_file(config: IngestConfig, path: Path) -> bool:
-    """Whether a mapping is for this file: tables do not always end in `.csv`."""
+def maps_file(config: IngestConfig, path: Path) -> bool:
+    """Whether some mapping is for this file; tables do not always end in `.csv`."""
     named = {mapping.topic for stream in STREAMS for mapping in mappings_of(config, stream)}
     return path.suffix.lower() in TABLES and bool(named & {path.name, path.stem})
 
@@ -70,8 +70,8 @@ def read_csv(path: Path, config: IngestConfig) -> CsvLog:
     streams: dict[Stream, pl.DataFrame] = {}
     left = Counter({CUT_ROW: log.cut, _UNITS_ROW: int(bool(log.units)), _SHORT_ROW: log.short, _BEFORE: log.before})
     for name, mapping in mappings:
-        mapped = _mapped(table, mapping, name, path, left, config)
-        frame = mapped.filter(_recorded(mapped, name, "fix" in mapping.fields))
+        mapped = _map_columns(table, mapping, name, path, left, config)
+        frame = mapped.filter(_have_values(mapped, name, "fix" in mapping.fields))
         left[f"row without a value of {name}"] += mapped.height - frame.height
         streams[name] = pl.concat([streams[name], frame], how="diagonal") if name in streams else frame
     parts = parts_of_table(path.name, table.height, table.columns, mappings)
@@ -93,11 +93,11 @@ def _with_ids(table: pl.DataFrame, mappings: Sequence[tuple[Stream, StreamMappin
     return table.with_columns(texts[name].replace("", None) for name in ids)
 
 
-def _recorded(frame: pl.DataFrame, stream: Stream, has_fix: bool) -> pl.Series:
+def _have_values(frame: pl.DataFrame, stream: Stream, has_fix: bool) -> pl.Series:
     """Rows that hold something of a stream: tables of several recorders leave cells empty.
 
     An empty position may as well be an outage, which a kind of fix would say. Without one it is none where the
-    positions around it follow each other as they usually do.
+    positions around it follow each other.
     """
     every = pl.repeat(True, frame.height, eager=True)
     names = [name for name in _VALUES.get(stream, ()) if name in frame.columns]
@@ -116,20 +116,20 @@ def _recorded(frame: pl.DataFrame, stream: Stream, has_fix: bool) -> pl.Series:
     return filled | has_fix | pl.Series(~between)
 
 
-def _mapped(
+def _map_columns(
     table: pl.DataFrame, mapping: StreamMapping, stream: Stream, path: Path, left: Counter[str], config: IngestConfig
 ) -> pl.DataFrame:
     """A table in the columns of a stream, by its mapping."""
     if not mapping.time.startswith("field:"):
         raise InputError("a CSV has no log time", place=str(path), expected='time = "field:COLUMN"')
-    kinds = {name: _kind(dtype) for name, dtype in table.schema.items()}
+    kinds = {name: _kind_of_values(dtype) for name, dtype in table.schema.items()}
     sample = Sample(Channel(0, path.name, "csv", None, str(path)), kinds)
     absent = [name for name in time_columns(table, mapping) if name not in table.columns]
     first = mapping.time if absent else f"field:{time_columns(table, mapping)[0]}"
     source = mapped_source(sample, stream, mapping.model_copy(update={"time": first}))
     refuse(source.breaches)
-    fields = pl.DataFrame([_typed(table[name], source, path) for name in source.types])
-    times = instants(table, mapping, path)
+    fields = pl.DataFrame([_cast_texts(table[name], source, path) for name in source.types])
+    times = parse_instants(table, mapping, path)
     counter = mapping.fields.get("distance_m") if stream == "odometer" else None
     if counter in fields.columns:
         sensors = fields[mapping.fields["sensor"]] if "sensor" in mapping.fields else None
@@ -137,20 +137,20 @@ def _mapped(
         whole, found = with_whole_counts(fields[counter], t_ns, mapping.wrap, sensors, config.wraps)
         fields = fields.with_columns(whole) if found else fields
         left.update(said_of_wraps(found, counter))
-    columns = {name: _not_nan(expression, fields) for name, expression in source.columns.items()}
+    columns = {name: _without_nan(expression, fields) for name, expression in source.columns.items()}
     if stream in ("gnss", "satellites"):
         columns = {"solution": pl.lit(mapping.solution, dtype=pl.String)} | columns
     return pl.DataFrame({"t": times}).with_columns(fields.select(pl.lit(0).alias("t"), **columns).drop("t"))
 
 
-def _kind(dtype: pl.DataType) -> str:
+def _kind_of_values(dtype: pl.DataType) -> str:
     """Kind of the values of a column, in the words of mappings."""
     if dtype.is_integer():
         return "int"
     return "float" if dtype.is_float() else "flag" if dtype == pl.Boolean else "text"
 
 
-def _typed(recorded: pl.Series, source: Source, path: Path) -> pl.Series:
+def _cast_texts(recorded: pl.Series, source: Source, path: Path) -> pl.Series:
     """Texts of a column in the type that its recipe names."""
     try:
         return recorded.cast(source.types[recorded.name])
@@ -167,7 +167,7 @@ def _typed(recorded: pl.Series, source: Source, path: Path) -> pl.Series:
         ) from None
 
 
-def _not_nan(expression: pl.Expr, fields: pl.DataFrame) -> pl.Expr:
+def _without_nan(expression: pl.Expr, fields: pl.DataFrame) -> pl.Expr:
     """The values without NaN: in a text that is how programs write that they have no value."""
     is_float = fields.lazy().select(expression.alias("value")).collect_schema()["value"].is_float()
     return expression.fill_nan(None) if is_float else expression

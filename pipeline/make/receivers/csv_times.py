@@ -49,7 +49,7 @@ def time_columns(table: pl.DataFrame, mapping: StreamMapping) -> list[str]:
     return parts if both else [named]
 
 
-def instants(table: pl.DataFrame, mapping: StreamMapping, path: Path) -> pl.Series:
+def parse_instants(table: pl.DataFrame, mapping: StreamMapping, path: Path) -> pl.Series:
     """UTC of each row, null where a cell is empty."""
     columns = [table[name] for name in time_columns(table, mapping)]
     place = f"{path}: column {' + '.join(column.name for column in columns)}"
@@ -63,12 +63,12 @@ def instants(table: pl.DataFrame, mapping: StreamMapping, path: Path) -> pl.Seri
             remedy="Remove time_zone from the mapping.",
         )
     if len(columns) == 2 and mapping.time_epoch == "gps" and not any(is_text):
-        return _week_and_seconds(columns[0], columns[1], mapping, place)
+        return _from_week_and_seconds(columns[0], columns[1], mapping, place)
     if mapping.time_epoch == "excel" and not any(is_text):
-        return _days(columns, mapping, place)
+        return _from_days(columns, mapping, place)
     if all(is_text):
         texts = columns[0] if len(columns) == 1 else columns[0] + " " + columns[1]
-        return utc_of(_texts(texts, mapping, place), mapping.time_scale)
+        return utc_of(_from_texts(texts, mapping, place), mapping.time_scale)
     if len(columns) == 1:
         return _parse_counts(columns[0], mapping, place)
     raise InputError(
@@ -79,7 +79,7 @@ def instants(table: pl.DataFrame, mapping: StreamMapping, path: Path) -> pl.Seri
     )
 
 
-def _refuse(
+def _refuse_values(
     wrong: pl.Series, values: pl.Series, place: str, message: str, expected: str, remedy: str | None = None
 ) -> None:
     """Refuse a column with values that are wrong, and show the first of them."""
@@ -90,23 +90,25 @@ def _refuse(
         )
 
 
-def _week_and_seconds(week: pl.Series, tow: pl.Series, mapping: StreamMapping, place: str) -> pl.Series:
-    """GPS time by definition, whatever `time_scale` says."""
+def _from_week_and_seconds(week: pl.Series, tow: pl.Series, mapping: StreamMapping, place: str) -> pl.Series:
+    """UTC of a GPS week and seconds of it; GPS time by definition, whatever `time_scale` says."""
     seconds = tow.cast(pl.Float64) * mapping.factors.get("t", 1.0)
     longest_s = WEEK_NS / NS_PER_S
     whole = ~week.is_between(_LEAST_WEEK, _MOST_WEEK).fill_null(True)
-    _refuse(whole, week, place, "holds no GPS week", f"{_LEAST_WEEK} to {_MOST_WEEK}", "Write the whole week number.")
+    _refuse_values(
+        whole, week, place, "holds no GPS week", f"{_LEAST_WEEK} to {_MOST_WEEK}", "Write the whole week number."
+    )
     beyond = ~seconds.is_between(0.0, longest_s).fill_null(True)
     remedy = "Give the seconds per unit: factors = { t = 1e-3 } for milliseconds."
-    _refuse(beyond, tow, place, "holds no seconds of a week", f"0 to {longest_s:g} s", remedy)
+    _refuse_values(beyond, tow, place, "holds no seconds of a week", f"0 to {longest_s:g} s", remedy)
     return utc_of(gps_ns_of_weeks(week.cast(pl.Int64), seconds), "gps")
 
 
-def _days(columns: list[pl.Series], mapping: StreamMapping, place: str) -> pl.Series:
-    """A day with its fraction, which may stand in another column."""
+def _from_days(columns: list[pl.Series], mapping: StreamMapping, place: str) -> pl.Series:
+    """UTC of days with their fraction, which may stand in another column."""
     days = sum((column.cast(pl.Float64) for column in columns[1:]), columns[0].cast(pl.Float64))
     wrong = ~days.is_between(LEAST_DAY, MOST_DAY).fill_null(True)
-    _refuse(wrong, days, place, "holds no days of Excel", f"{LEAST_DAY} to {MOST_DAY}")
+    _refuse_values(wrong, days, place, "holds no days of Excel", f"{LEAST_DAY} to {MOST_DAY}")
     written = time_source(("days",), {"days": "float"}, mapping).instants(pl.DataFrame({"days": days}), "t")
     if mapping.time_zone is None:
         return written
@@ -114,19 +116,19 @@ def _days(columns: list[pl.Series], mapping: StreamMapping, place: str) -> pl.Se
     return _from_zone(local_ns, local_ns.is_not_null(), mapping.time_zone, place).cast(written.dtype)
 
 
-def _texts(texts: pl.Series, mapping: StreamMapping, place: str) -> pl.Series:
-    """Nanoseconds since 1970; without a zone as they stand."""
+def _from_texts(texts: pl.Series, mapping: StreamMapping, place: str) -> pl.Series:
+    """Nanoseconds since 1970 of times as texts; without a zone as they stand."""
     texts = texts.str.strip_chars().replace("", None)
     parts = texts.str.extract_groups(_TEXT).struct.unnest()
-    _refuse(parts["h"].is_null() & texts.is_not_null(), texts, place, "holds no times", _FORMS)
+    _refuse_values(parts["h"].is_null() & texts.is_not_null(), texts, place, "holds no times", _FORMS)
     if mapping.time_zone is None:
         lettered = parts["letters"].is_not_null() & parts["zone"].is_null()
         remedy = 'Name the place whose clock it is in the mapping: time_zone = "Europe/Berlin".'
-        _refuse(
+        _refuse_values(
             lettered, texts, place, "holds times of a zone that its letters do not tell for certain", _FORMS, remedy
         )
     number = parts.select(pl.all().exclude("half", "zone", "letters", "f").cast(pl.Int64))
-    day, month = ("a", "b") if _day_first(number["a"], number["b"], mapping.date_order, place) else ("b", "a")
+    day, month = ("a", "b") if _has_day_first(number["a"], number["b"], mapping.date_order, place) else ("b", "a")
     year = pl.when(pl.col("c") < 100).then(pl.col("c") + 2000).otherwise(pl.col("c"))
     late = parts["half"].str.to_lowercase()
     hour = pl.when(late.is_null()).then(pl.col("h")).otherwise(pl.col("h") % 12 + 12 * (late == "pm").cast(pl.Int64))
@@ -138,7 +140,7 @@ def _texts(texts: pl.Series, mapping: StreamMapping, place: str) -> pl.Series:
         whole = within(number.select(civil.dt.timestamp("us")).to_series(), 1000) * 1000
     except pl.exceptions.PolarsError as error:
         raise InputError(f"holds no times: {str(error).splitlines()[0]}", place=place, expected=_FORMS) from None
-    _refuse(whole.is_null() & texts.is_not_null(), texts, place, "holds no times", _FORMS)
+    _refuse_values(whole.is_null() & texts.is_not_null(), texts, place, "holds no times", _FORMS)
     fraction = parts["f"].fill_null("0").str.pad_end(9, "0").cast(pl.Int64)
     written_ns = whole + fraction
     if mapping.time_zone is not None:
@@ -171,16 +173,16 @@ def _from_zone(local_ns: pl.Series, local: pl.Series, zone: str, place: str) -> 
             f"If the logger does not change its clock in spring, say so: time_zone = {_fixed_zone(before_ns - utc_ns)}."
         )
         expected = "times that there are; clocks leave an hour out in spring"
-        _refuse(never, civil, place, f"holds a time that clocks never show in {zone}", expected, remedy)
-    instants, unclear = _resolve_repeated_hours(local_ns, first, second, local & (first != second))
+        _refuse_values(never, civil, place, f"holds a time that clocks never show in {zone}", expected, remedy)
+    parse_instants, unclear = _resolve_repeated_hours(local_ns, first, second, local & (first != second))
     if unclear.any():
         row = int(unclear.arg_max() or 0)
         zones = " or ".join(_fixed_zone(local_ns[row] - utc_ns[row]) for utc_ns in (first, second))
         fixed = f"if one of them holds for all rows: time_zone = {zones}."
         remedy = f"Let the logger write UTC or the offset (+02:00), or, {fixed}"
         expected = "each time once, or rows that show the change; clocks show an hour twice in autumn"
-        _refuse(unclear, civil, place, f"holds a time that is not clear in {zone}", expected, remedy)
-    return pl.select(pl.when(local).then(instants).otherwise(local_ns)).to_series()
+        _refuse_values(unclear, civil, place, f"holds a time that is not clear in {zone}", expected, remedy)
+    return pl.select(pl.when(local).then(parse_instants).otherwise(local_ns)).to_series()
 
 
 def _refuse_other_letters(utc_ns: pl.Series, letters: pl.Series, texts: pl.Series, zone: str, place: str) -> None:
@@ -189,7 +191,9 @@ def _refuse_other_letters(utc_ns: pl.Series, letters: pl.Series, texts: pl.Serie
     english = letters.replace(_GERMAN_LETTERS)
     wrong = english.is_not_null() & then.str.contains("^[A-Z]+$") & (english != then)
     remedy = "Name the zone of these letters, or one of a fixed offset, such as Etc/GMT-1."
-    _refuse(wrong, texts, place, f"holds times whose letters are not those of {zone}", "letters of this zone", remedy)
+    _refuse_values(
+        wrong, texts, place, f"holds times whose letters are not those of {zone}", "letters of this zone", remedy
+    )
 
 
 def _fixed_zone(ahead_ns: int) -> str:
@@ -206,8 +210,8 @@ def _resolve_repeated_hours(
     Rows that follow each other within a minute show the one step back by the hour; without it, they are of the first
     hour where they go on from before it, of the second where they go on behind it.
     """
-    instants = first.to_numpy().copy()
-    unclear = np.zeros(instants.size, dtype=np.bool_)
+    parse_instants = first.to_numpy().copy()
+    unclear = np.zeros(parse_instants.size, dtype=np.bool_)
     clock_ns = local_ns.fill_null(0).to_numpy()
     steps_ns = np.diff(clock_ns)
     back_ns = second.fill_null(0).to_numpy() - first.fill_null(0).to_numpy()
@@ -223,8 +227,8 @@ def _resolve_repeated_hours(
             unclear[rows] = True
         elif turn.size or behind:
             later = slice(begin + int(turn[0]) + 1 if turn.size else begin, end + 1)
-            instants[later] += back_ns[begin]
-    return pl.Series(instants).set(first.is_null(), None), pl.Series(unclear)
+            parse_instants[later] += back_ns[begin]
+    return pl.Series(parse_instants).set(first.is_null(), None), pl.Series(unclear)
 
 
 def _offset_ns(zone: pl.Series) -> pl.Series:
@@ -235,7 +239,7 @@ def _offset_ns(zone: pl.Series) -> pl.Series:
     return sign * minutes * 60 * NS_PER_S
 
 
-def _day_first(first: pl.Series, second: pl.Series, asked: str, place: str) -> bool:
+def _has_day_first(first: pl.Series, second: pl.Series, asked: str, place: str) -> bool:
     """Whether dates such as 01.02.2025 begin with the day: decided over the whole file, never guessed."""
     fitting = orders_of_day(first, second)
     if not fitting or (asked != "auto" and asked not in fitting):
@@ -258,7 +262,7 @@ def _day_first(first: pl.Series, second: pl.Series, asked: str, place: str) -> b
     return (asked if asked != "auto" else fitting[0]) == "day_first"
 
 
-def _looks_like(count: int) -> str:
+def _likely_unit(count: int) -> str:
     """The unit in which a time since 1970 lies between 1985 and 2065."""
     units_s = {"milliseconds": 1e-3, "microseconds": 1e-6}
     return next((f"; looks like {unit}" for unit, unit_s in units_s.items() if 5e8 < count * unit_s < 3e9), "")
@@ -272,7 +276,7 @@ def _parse_counts(recorded: pl.Series, mapping: StreamMapping, place: str) -> pl
         largest = int(np.abs(recorded.drop_nulls().to_numpy().astype(np.float64)).max(initial=0))
         if _MOST_SECONDS < largest < _LEAST_NANOSECONDS:
             raise InputError(
-                f"time unit unknown{_looks_like(largest)}",
+                f"time unit unknown{_likely_unit(largest)}",
                 place=place,
                 found=str(largest),
                 expected="seconds or nanoseconds",

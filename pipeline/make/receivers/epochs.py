@@ -44,8 +44,8 @@ class Epoch:
         """Whether messages said what kind of fix the epoch has and where, or that it has none."""
         return "fix" in self.gnss and (bool(self.positions) or self.gnss["fix"] == Fix.NONE)
 
-    def put(self, what: str, rank: int, columns: dict[str, Any]) -> None:
-        """Columns that several messages give: those of the highest rank stay, whichever comes first."""
+    def put_columns(self, what: str, rank: int, columns: dict[str, Any]) -> None:
+        """Put columns that several messages give (`what`); those of the highest rank stay, whichever comes first."""
         if rank >= self._ranks.get(what, rank):
             self._ranks[what] = rank
             self.gnss |= columns
@@ -60,7 +60,7 @@ class Gathered:
     twins: list[tuple[Epoch, Epoch]] = field(default_factory=list)  # neighbours of one key with different positions
     _latest: dict[Hashable, Epoch] = field(default_factory=dict)
 
-    def at(self, key: Hashable, position: str = "", content: bytes = b"") -> Epoch:
+    def epoch_at(self, key: Hashable, position: str = "", content: bytes = b"") -> Epoch:
         """The epoch of this key that a message belongs to.
 
         `position`: name of the message where it is one that tells a position, with its `content`. Another one than the
@@ -88,22 +88,22 @@ class Gathered:
         return frozenset()
 
     @property
-    def widest_m(self) -> float:
-        """How far apart their positions are at most."""
+    def rival_distance_m(self) -> float:
+        """Largest distance between positions of several receivers at one time [m]."""
         return 0.0
 
-    def drop(self, reason: str, count: int = 1) -> None:
+    def count_dropped(self, reason: str, count: int = 1) -> None:
         """Count records that are left out for a reason."""
         if count:
             self.dropped[reason] = self.dropped.get(reason, 0) + count
 
-    def settled(self) -> Epochs:
+    def settle_epochs(self) -> Epochs:
         """The epochs whose time and kind of fix are known; the others are counted."""
         filled = [epoch for epoch in self.epochs if epoch.gnss or epoch.satellites]
         known = [epoch for epoch in filled if epoch.has_fix]
-        self.drop("epoch without its position message", len(filled) - len(known))
+        self.count_dropped("epoch without its position message", len(filled) - len(known))
         timed = [epoch for epoch in known if epoch.t_ns is not None and 0 <= epoch.t_ns <= LATEST_NS]
-        self.drop("time not valid", len(known) - len(timed))
+        self.count_dropped("time not valid", len(known) - len(timed))
         return Epochs(timed)
 
 
@@ -120,14 +120,14 @@ class Epochs:
 
     def streams(self) -> dict[Stream, pl.DataFrame]:
         """`gnss`, and `satellites` where any epoch has them."""
-        fixes = [{"t": epoch.t_ns, "solution": "primary", **_of_fix(epoch.gnss)} for epoch in self.epochs]
+        fixes = [{"t": epoch.t_ns, "solution": "primary", **_without_unfixed(epoch.gnss)} for epoch in self.epochs]
         ranges = [{"t": epoch.t_ns, "solution": "primary", **row} for epoch in self.epochs for row in epoch.satellites]
         streams: dict[Stream, pl.DataFrame] = {"gnss": frame_of(fixes, Gnss)}
         return streams | ({"satellites": frame_of(ranges, Satellites)} if ranges else {})
 
 
-def _of_fix(gnss: dict[str, Any]) -> dict[str, Any]:
-    """Without a fix, what other messages of the epoch say of a position is not to be believed."""
+def _without_unfixed(gnss: dict[str, Any]) -> dict[str, Any]:
+    """The columns; without a fix those of a position are left out, whatever other messages of the epoch say."""
     return gnss if gnss["fix"] != Fix.NONE else {name: gnss.get(name) for name in ("fix", "satellites")}
 
 
@@ -139,12 +139,12 @@ def frame_of(rows: list[dict[str, Any]], schema: type[dy.Schema]) -> pl.DataFram
     return frame.with_columns(pl.col("t").cast(pl.Datetime("ns", "UTC")))
 
 
-def velocity(east: float, north: float, up: float) -> dict[str, float]:
+def velocity_columns(east: float, north: float, up: float) -> dict[str, float]:
     """The `gnss` columns of a velocity [m/s]."""
     return {"vel_e_mps": float(east), "vel_n_mps": float(north), "vel_u_mps": float(up)}
 
 
-def covariance(ee: float, en: float, eu: float, nn: float, nu: float, uu: float) -> dict[str, float]:
+def covariance_columns(ee: float, en: float, eu: float, nn: float, nu: float, uu: float) -> dict[str, float]:
     """The `gnss` columns of a covariance [m2]."""
     names = ("cov_ee_m2", "cov_en_m2", "cov_eu_m2", "cov_nn_m2", "cov_nu_m2", "cov_uu_m2")
     return {name: float(value) for name, value in zip(names, (ee, en, eu, nn, nu, uu), strict=True)}

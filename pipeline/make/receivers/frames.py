@@ -17,6 +17,8 @@ from typing import NamedTuple
 
 
 class Protocol(StrEnum):
+    """A protocol of receivers: how its messages begin, and how the end of one is found."""
+
     UBX = "UBX"
     SBF = "SBF"
     NMEA = "NMEA"
@@ -52,7 +54,7 @@ _UBX_OVERHEAD = 8
 _SBF_HEAD = 8
 
 
-def frames(
+def whole_messages(
     content: bytes, on_damage: Callable[[], None], on_unchecked: Callable[[], None] | None = None
 ) -> Iterator[Frame]:
     """All whole messages in order; `on_damage` is called once for each that is damaged or cut off.
@@ -79,7 +81,7 @@ def frames(
 
 
 def _ubx_end(content: bytes, start: int) -> int | None:
-    """u-blox interface description, "UBX checksum": 8-bit Fletcher over class, id, length and payload."""
+    """End of a whole message in the content, None if damaged. "UBX checksum": 8-bit Fletcher over class to payload."""
     end = start + _UBX_OVERHEAD + int.from_bytes(content[start + 4 : start + 6], "little")
     if end > len(content):
         return None
@@ -89,7 +91,10 @@ def _ubx_end(content: bytes, start: int) -> int | None:
 
 
 def _sbf_end(content: bytes, start: int) -> int | None:
-    """SBF reference guide, "block header": CRC-CCITT over id, length and body; the length is a multiple of four."""
+    """End of a whole block in the content, None if damaged. "Block header": CRC-CCITT over id, length and body.
+
+    The length is a multiple of four (SBF reference guide).
+    """
     length = int.from_bytes(content[start + 6 : start + 8], "little")
     if length < _SBF_HEAD or length % 4 or start + length > len(content):
         return None
@@ -98,7 +103,7 @@ def _sbf_end(content: bytes, start: int) -> int | None:
 
 
 def _nmea_end(content: bytes, start: int) -> int | None:
-    """NMEA 0183: exclusive or of all characters between `$` and `*`."""
+    """End of a whole sentence in the content, None if damaged. NMEA 0183: exclusive or from `$` to `*`."""
     sentence = _SENTENCE.match(content, start)
     if sentence is None or reduce(xor, sentence[1]) != int(sentence[2], 16):
         return None
@@ -106,7 +111,7 @@ def _nmea_end(content: bytes, start: int) -> int | None:
 
 
 def _novatel_end(content: bytes, start: int) -> int | None:
-    """OEM7 commands and logs reference manual, "32-bit CRC": over all from the start, of ASCII without its sign."""
+    """End of a whole log in the content, None if damaged. "32-bit CRC" over all, of ASCII without its sign (OEM7)."""
     if content[start : start + 1] in (b"#", b"%"):
         line = _NOVATEL_LINE.match(content, start)
         return line.end() if line and _crc32(line[1]) == int(line[2], 16) else None

@@ -16,8 +16,8 @@ from typing import Any
 
 import polars as pl
 
-from pipeline.make.receivers.epochs import Gathered, satellite_name, velocity
-from pipeline.make.receivers.rivals import metres, sees_twins, two_receivers
+from pipeline.make.receivers.epochs import Gathered, satellite_name, velocity_columns
+from pipeline.make.receivers.rivals import distance_m, twin_distance_m, two_receivers_error
 from schemas.arrays import NS_PER_S
 from schemas.enums import Fix
 from schemas.run import Stream
@@ -46,29 +46,29 @@ def read_gpsd(
     """Streams, and what could not be used. `solution`: the device that is meant, where the log holds several."""
     gathered = Gathered()
     devices: Counter[str] = Counter()
-    reports = list(_objects(content, gathered))
+    reports = list(_used_objects(content, gathered))
     for report in reports:
         if report["class"] == "TPV" and _has_fix(report):
-            devices[_device(report)] += 1
+            devices[_device_name(report)] += 1
     chosen = next((name for name in devices if solution in (name, name.rsplit("/", 1)[-1])), None)
     if len(devices) > 1 and chosen is None:
-        raise two_receivers(str(log), frozenset(devices), _apart_m(reports), "device")
+        raise two_receivers_error(str(log), frozenset(devices), _device_distance_m(reports), "device")
     for report in reports:
-        if len(devices) < 2 or _device(report) == chosen:
+        if len(devices) < 2 or _device_name(report) == chosen:
             _DECODERS[report["class"]](gathered, report)
-    if (apart_m := sees_twins(gathered)) is not None:
-        raise two_receivers(str(log), frozenset(), apart_m)
-    epochs = gathered.settled()
+    if (apart_m := twin_distance_m(gathered)) is not None:
+        raise two_receivers_error(str(log), frozenset(), apart_m)
+    epochs = gathered.settle_epochs()
     return epochs.streams(), gathered.dropped
 
 
-def objects_in(content: bytes) -> dict[tuple[str, bool], int]:
+def count_objects(content: bytes) -> dict[tuple[str, bool], int]:
     """How many objects of each class there are, and whether it is read."""
     names = re.findall(rb'(?m)^\s*\{\s*"class"\s*:\s*"(\w+)"', content)
     return dict(Counter((f"gpsd {name.decode()}", name.decode() in _DECODERS) for name in names))
 
 
-def _objects(content: bytes, gathered: Gathered) -> Iterator[dict[str, Any]]:
+def _used_objects(content: bytes, gathered: Gathered) -> Iterator[dict[str, Any]]:
     """TPV and SKY; others are of no interest, what is no whole object is counted."""
     for line in content.splitlines():
         text = line.strip().rstrip(b",")
@@ -77,16 +77,16 @@ def _objects(content: bytes, gathered: Gathered) -> Iterator[dict[str, Any]]:
         try:
             found = json.loads(text)
         except ValueError:  # also of bytes that are no text
-            gathered.drop("damaged message")
+            gathered.count_dropped("damaged message")
             continue
         except RecursionError:
-            gathered.drop("damaged message")
+            gathered.count_dropped("damaged message")
             continue
         if isinstance(found, dict) and found.get("class") in ("TPV", "SKY"):
             yield found
 
 
-def _device(found: dict[str, Any]) -> str:
+def _device_name(found: dict[str, Any]) -> str:
     """Name of the receiver that a report is of."""
     return str(found.get("device", ""))
 
@@ -103,7 +103,7 @@ def _number(found: dict[str, Any], name: str, other: Any = None) -> Any:
     return float(value) if known and isinstance(value, int | float) else other
 
 
-def _apart_m(reports: list[dict[str, Any]]) -> float:
+def _device_distance_m(reports: list[dict[str, Any]]) -> float:
     """How far apart devices tell to be at one time [m]; 0 where they never tell of the same."""
     places: dict[int, tuple[str, tuple[float, float]]] = {}
     widest_m = 0.0
@@ -112,9 +112,9 @@ def _apart_m(reports: list[dict[str, Any]]) -> float:
         if t_ns is None or found["class"] != "TPV" or not _has_fix(found):
             continue
         place = (float(found["lat"]), float(found["lon"]))
-        device, other = places.setdefault(t_ns, (_device(found), place))
-        if device != _device(found):
-            widest_m = max(widest_m, metres(place, other))
+        device, other = places.setdefault(t_ns, (_device_name(found), place))
+        if device != _device_name(found):
+            widest_m = max(widest_m, distance_m(place, other))
     return widest_m
 
 
@@ -136,15 +136,15 @@ def _time_ns(found: dict[str, Any]) -> int | None:
     return int(moment.timestamp()) * NS_PER_S + int(rest[:9].ljust(9, "0") or 0)
 
 
-def _position(gathered: Gathered, found: dict[str, Any]) -> None:
+def _put_position(gathered: Gathered, found: dict[str, Any]) -> None:
     """Put down the position of a report."""
     t_ns = _time_ns(found)
     if t_ns is None:
-        gathered.drop("time not valid")
+        gathered.count_dropped("time not valid")
         return
-    fix = _kind(found)
+    fix = _fix_kind(found)
     place = b"" if fix is Fix.NONE else f"{found['lat']} {found['lon']}".encode()
-    epoch = gathered.at(t_ns, "TPV", place)
+    epoch = gathered.epoch_at(t_ns, "TPV", place)
     epoch.t_ns = t_ns
     epoch.gnss["fix"] = fix.value
     if fix is Fix.NONE:
@@ -155,7 +155,7 @@ def _position(gathered: Gathered, found: dict[str, Any]) -> None:
     epoch.gnss |= _velocity(found)
 
 
-def _kind(found: dict[str, Any]) -> Fix:
+def _fix_kind(found: dict[str, Any]) -> Fix:
     """Kind of fix of a report."""
     if not _has_fix(found):
         return Fix.NONE
@@ -176,7 +176,7 @@ def _velocity(found: dict[str, Any]) -> dict[str, float]:
     """Velocity by axes where reported, else by speed [m/s] and course [deg from true north]."""
     axes = [_number(found, name) for name in ("velE", "velN", "velD")]
     if None not in axes:
-        return velocity(axes[0], axes[1], -axes[2])
+        return velocity_columns(axes[0], axes[1], -axes[2])
     speed, course = _number(found, "speed"), _number(found, "track")
     if speed is None or course is None:
         return {}
@@ -186,14 +186,14 @@ def _velocity(found: dict[str, Any]) -> dict[str, float]:
     return plane | ({"vel_u_mps": climb} if climb is not None else {})
 
 
-def _sky(gathered: Gathered, found: dict[str, Any]) -> None:
+def _put_satellites(gathered: Gathered, found: dict[str, Any]) -> None:
     """Satellites of an epoch; a list without a time is of none."""
     t_ns = _time_ns(found)
     listed = found.get("satellites")
     if t_ns is None or not isinstance(listed, list):
-        gathered.drop("satellites without a time")
+        gathered.count_dropped("satellites without a time")
         return
-    epoch = gathered.at(t_ns)
+    epoch = gathered.epoch_at(t_ns)
     rows = [row for entry in listed if isinstance(entry, dict) and (row := _satellite(entry)) is not None]
     epoch.satellites = list({row["sv"]: row for row in rows}.values())
     epoch.gnss["satellites"] = sum(row["used"] for row in epoch.satellites)
@@ -201,7 +201,7 @@ def _sky(gathered: Gathered, found: dict[str, Any]) -> None:
 
 def _satellite(entry: dict[str, Any]) -> dict[str, Any] | None:
     """One satellite of a report, if it is complete."""
-    name = _name(entry)
+    name = _satellite_name(entry)
     azimuth_deg, elevation_deg = _number(entry, "az"), _number(entry, "el")
     if name is None or azimuth_deg is None or elevation_deg is None or not abs(elevation_deg) <= 90.0:
         return None
@@ -215,7 +215,7 @@ def _satellite(entry: dict[str, Any]) -> dict[str, Any] | None:
     }
 
 
-def _name(entry: dict[str, Any]) -> str | None:
+def _satellite_name(entry: dict[str, Any]) -> str | None:
     """Name of a satellite, by its system or its PRN."""
     system, number, prn = (_number(entry, name) for name in ("gnssid", "svid", "PRN"))
     if system is not None and number is not None and int(system) in _SYSTEMS and 0 < number < 256:
@@ -224,4 +224,4 @@ def _name(entry: dict[str, Any]) -> str | None:
     return next((satellite_name(*satellite) for satellite in known), None)
 
 
-_DECODERS = {"TPV": _position, "SKY": _sky}
+_DECODERS = {"TPV": _put_position, "SKY": _put_satellites}

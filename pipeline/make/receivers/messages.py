@@ -12,8 +12,8 @@ from typing import Any
 from pipeline.make.receivers import nmea, novatel, sbf, ubx
 from pipeline.make.receivers.adding import Streams
 from pipeline.make.receivers.epochs import Epochs, Gathered
-from pipeline.make.receivers.frames import Frame, Protocol, frames, name_of
-from pipeline.make.receivers.rivals import sees_twins, two_receivers
+from pipeline.make.receivers.frames import Frame, Protocol, name_of, whole_messages
+from pipeline.make.receivers.rivals import twin_distance_m, two_receivers_error
 from pipeline.read.ingest.parts import LogPart, parts_of_messages
 from schemas.errors import InputError
 
@@ -55,36 +55,38 @@ def read_messages(
     gathered = {protocol: Gathered() for protocol in _PROTOCOLS}
     gathered[Protocol.NMEA] = nmea.Sentences(left_out=left_out)
     named: Counter[tuple[Protocol, str, bool]] = Counter()
-    for frame in frames(content, lambda: dropped.update(["damaged message"]), lambda: dropped.update([_UNCHECKED])):
-        is_used = frame.protocol in gathered and _decode(frame, gathered[frame.protocol])
+    for frame in whole_messages(
+        content, lambda: dropped.update(["damaged message"]), lambda: dropped.update([_UNCHECKED])
+    ):
+        is_used = frame.protocol in gathered and _decode_message(frame, gathered[frame.protocol])
         named[frame.protocol, name_of(frame), is_used] += 1
-    twins = {protocol: sees_twins(of) for protocol, of in gathered.items()}
+    twins = {protocol: twin_distance_m(of) for protocol, of in gathered.items()}
     ubx.settle_times(gathered[Protocol.UBX])
     nmea.settle_days(gathered[Protocol.NMEA], date)
     novatel.settle_source(gathered[Protocol.NOVATEL])
-    settled = {protocol: epochs.settled() for protocol, epochs in gathered.items()}
-    best = max(settled, key=lambda protocol: _worth(protocol, settled[protocol]))
+    settled = {protocol: epochs.settle_epochs() for protocol, epochs in gathered.items()}
+    best = max(settled, key=lambda protocol: _information_of(protocol, settled[protocol]))
     for protocol, epochs in settled.items():
         if protocol is best or not settled[best].positions:
             dropped.update(gathered[protocol].dropped)
         elif epochs.positions:
             dropped[f"{protocol} position beside those of {best}"] += epochs.positions
     if not settled[best].epochs:
-        raise _no_epoch(content, log, dropped)
+        raise _no_epoch_error(content, log, dropped)
     rivals = gathered[best].rivals
     if solution in rivals:
         return read_messages(content, log, date, None, rivals - {solution})
     if rivals or twins[best] is not None:
-        raise two_receivers(str(log), rivals, max(gathered[best].widest_m, twins[best] or 0.0))
+        raise two_receivers_error(str(log), rivals, max(gathered[best].rival_distance_m, twins[best] or 0.0))
     counts = Counter({(name, used and protocol is best): 0 for protocol, name, used in named})
     for (protocol, name, used), count in named.items():
         counts[name, used and protocol is best] += count
     return settled[best].streams(), dropped, tuple(parts_of_messages(log.name, counts))
 
 
-def _no_epoch(content: bytes, log: Path, dropped: Mapping[str, int]) -> InputError:
-    """What there is in place of positions tells what to change at the receiver."""
-    counts = Counter(name_of(frame) for frame in frames(content, lambda: None))
+def _no_epoch_error(content: bytes, log: Path, dropped: Mapping[str, int]) -> InputError:
+    """The error for a log without positions; what there is instead tells what to change at the receiver."""
+    counts = Counter(name_of(frame) for frame in whole_messages(content, lambda: None))
     if not counts:
         head = content[:_HEAD]
         hint = next((hint for pattern, hint in _ALMOST.items() if re.search(pattern, head)), _OTHER)
@@ -105,12 +107,12 @@ def _no_epoch(content: bytes, log: Path, dropped: Mapping[str, int]) -> InputErr
     )
 
 
-def _worth(protocol: Protocol, epochs: Epochs) -> int:
+def _information_of(protocol: Protocol, epochs: Epochs) -> int:
     """A receiver that sends NMEA beside its own protocol rounds there, and leaves out how accurate it is."""
     return epochs.positions * (1 if protocol is Protocol.NMEA else 2)
 
 
-def _decode(frame: Frame, gathered: Gathered) -> bool:
+def _decode_message(frame: Frame, gathered: Gathered) -> bool:
     """Add what a message says to its epoch; whether it is of a kind that is used."""
     parse, decode = _PROTOCOLS[frame.protocol]
     try:
@@ -123,13 +125,13 @@ def _decode(frame: Frame, gathered: Gathered) -> bool:
         ) from None
     except Exception:
         # The parsers' own errors share no base class.
-        gathered.drop(_UNFIT)
+        gathered.count_dropped(_UNFIT)
         return True
     try:
         if message is not None:
             decode(gathered, message, frame.content)
     except (AttributeError, OverflowError):  # a message that ends before its fields do, a time beyond all calendars
-        gathered.drop(_UNFIT)
+        gathered.count_dropped(_UNFIT)
     return message is not None
 
 

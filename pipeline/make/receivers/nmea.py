@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from pipeline.make.receivers.epochs import Epoch, Gathered
-from pipeline.make.receivers.rivals import Said, Talkers
+from pipeline.make.receivers.rivals import Talkers, ToldPosition
 from pipeline.read.ingest.guesses import UNITS
 from schemas.arrays import NS_PER_S
 from schemas.enums import Fix
@@ -46,17 +46,17 @@ def decode(gathered: Gathered, message: Any, raw: bytes) -> None:
     """Add what this sentence says to its epoch, whose key is the time of day; most tell no more of the time."""
     assert isinstance(gathered, Sentences)
     if message.talker in gathered.left_out:
-        gathered.drop("sentence of another talker")
+        gathered.count_dropped("sentence of another talker")
         return
     if message.msgID == "DTM":
-        gathered.datums[message.talker] = _datum(message)
+        gathered.datums[message.talker] = _datum_code(message)
         return
     if not isinstance(message.time, time):
-        gathered.drop("time not valid")
+        gathered.count_dropped("time not valid")
         return
-    if message.msgID in _POSITIONS and not _belongs(gathered, message, raw):
+    if message.msgID in _POSITIONS and not _belongs_to_epoch(gathered, message, raw):
         return
-    epoch = gathered.at(message.time, message.identity if message.msgID in _POSITIONS else "", raw)
+    epoch = gathered.epoch_at(message.time, message.identity if message.msgID in _POSITIONS else "", raw)
     # Before its first position a receiver tells a date of its own making.
     if message.msgID == "RMC" and isinstance(message.date, date) and (message.status == "A" or message.lat != ""):
         epoch.t_ns = _time_ns(message.date, message.time)
@@ -80,36 +80,36 @@ class Sentences(Gathered):
         return self.talkers.rivals
 
     @property
-    def widest_m(self) -> float:
+    def rival_distance_m(self) -> float:
         """How far apart two talkers are at most [m]."""
         return self.talkers.widest_m
 
 
-def _datum(m: Any) -> str:
+def _datum_code(m: Any) -> str:
     """Code of the datum by DTM, where positions are not those of WGS 84."""
     code = str(m.datum).strip().upper()
     shifted = any(isinstance(value, float | int) and value for value in (m.latOfset, m.lonOfset))
     return "" if code in ("", "W84") and not shifted else code or "999"
 
 
-def _belongs(gathered: Sentences, m: Any, raw: bytes) -> bool:
+def _belongs_to_epoch(gathered: Sentences, m: Any, raw: bytes) -> bool:
     """Whether a position is of WGS 84 (or named for what it nearly is), and of the receiver of its epoch."""
     datum = gathered.datums.get(m.talker) or ""
     if datum in _NEAR_WGS84 or (datum and "89" in datum):
-        gathered.drop(f"position in {datum} (kept: decimetres from WGS 84)")
+        gathered.count_dropped(f"position in {datum} (kept: decimetres from WGS 84)")
     elif datum:
-        gathered.drop(f"position in another datum than WGS 84 ({datum})")
+        gathered.count_dropped(f"position in another datum than WGS 84 ({datum})")
         return False
-    said = Said(m.talker, None)
+    said = ToldPosition(m.talker, None)
     if m.lat != "" and m.lon != "" and _has_fix(m):
-        said = Said(m.talker, (float(m.lat), float(m.lon)), _digit_m(raw))
+        said = ToldPosition(m.talker, (float(m.lat), float(m.lon)), _last_digit_m(raw))
     before = gathered.talkers.latest(m.time)
-    if not gathered.talkers.taken(m.time, said):
+    if not gathered.talkers.take_position(m.time, said):
         reason = "no fix beside the position of another talker" if said.place is None else "position of another talker"
-        gathered.drop(reason)
+        gathered.count_dropped(reason)
         return False
     if before is not None and before.talker != m.talker and before.place is None and said.place is not None:
-        gathered.at(m.time).gnss.clear()
+        gathered.epoch_at(m.time).gnss.clear()
     return True
 
 
@@ -121,7 +121,7 @@ def _has_fix(m: Any) -> bool:
     return kind is not Fix.NONE if m.msgID == "GGA" else any(mode in str(m.posMode) for mode in _MODES)
 
 
-def _digit_m(raw: bytes) -> float:
+def _last_digit_m(raw: bytes) -> float:
     """The last digit of the minutes of the latitude, as a length: a minute is 1852 m."""
     field_of = {b"GGA": 2, b"GNS": 2, b"RMC": 3}[raw[3:6]]
     return float(1852.0 * 10.0 ** -len(raw.split(b",")[field_of].partition(b".")[2]))
@@ -134,7 +134,7 @@ def settle_days(gathered: Gathered, first_day: date | None = None) -> None:
     the first date may be that of a receiver just switched on, whose clock is not set yet: it is dropped.
     """
     epochs = gathered.epochs
-    gathered.drop("date that turned late or early at midnight (put right)", _turned_dates(epochs))
+    gathered.count_dropped("date that turned late or early at midnight (put right)", _correct_turned_dates(epochs))
     first = next((number for number, epoch in enumerate(epochs) if epoch.t_ns is not None), None)
     if first is None and first_day is not None and epochs:
         first = 0
@@ -142,16 +142,16 @@ def settle_days(gathered: Gathered, first_day: date | None = None) -> None:
     early = epochs[:first]
     if first is not None:
         early = [epoch for epoch in early if epoch.gnss.get("fix", Fix.NONE.value) == Fix.NONE.value]
-    gathered.drop("time without a date", len(early))
+    gathered.count_dropped("time without a date", len(early))
     dropped = {epoch.number for epoch in early}
     gathered.epochs = [epoch for epoch in epochs if epoch.number not in dropped]
     for sense in (1, -1):
         for known, epoch in pairwise(gathered.epochs[::sense]):
             if epoch.t_ns is None and known.t_ns is not None:
-                epoch.t_ns = _time_next_to(known.t_ns, epoch.key, sense)
+                epoch.t_ns = _neighbour_time_ns(known.t_ns, epoch.key, sense)
 
 
-def _turned_dates(epochs: list[Epoch]) -> int:
+def _correct_turned_dates(epochs: list[Epoch]) -> int:
     """Put dates that turn near midnight on the day of their neighbours; how many.
 
     Seen by time that goes back by a day within one step: so does no clock. The dates are wrong until time goes on by a
@@ -173,8 +173,8 @@ def _turned_dates(epochs: list[Epoch]) -> int:
     return turned
 
 
-def _time_next_to(known_ns: int, moment: time, sense: int) -> int:
-    """The time of an epoch after (1) or before (-1) one whose time is known: of the same day, or past midnight."""
+def _neighbour_time_ns(known_ns: int, moment: time, sense: int) -> int:
+    """The time of an epoch after (1) or before (-1) one of known time [ns]; of the same day, or past midnight."""
     t_ns = known_ns - known_ns % _DAY_NS + _time_ns(date(1970, 1, 1), moment)
     return t_ns + sense * _DAY_NS if sense * (known_ns - t_ns) > _DAY_NS // 2 else t_ns
 
@@ -193,19 +193,19 @@ def _date_of(m: Any) -> date | None:
         return None
 
 
-def _position(epoch: Epoch, m: Any) -> None:
+def _put_gga(epoch: Epoch, m: Any) -> None:
     """GGA: kind of fix and position, of which an RMC of the epoch may have said less."""
-    _put(epoch, m, _FIXES.get(int(m.quality or 0), Fix.NONE))
+    _put_position(epoch, m, _FIXES.get(int(m.quality or 0), Fix.NONE))
 
 
-def _position_of_systems(epoch: Epoch, m: Any) -> None:
+def _put_gns(epoch: Epoch, m: Any) -> None:
     """GNS: a letter of `posMode` per satellite system; the kind of fix of a GGA stands."""
     if epoch.gnss.get("satellites") is None:
-        _put(epoch, m, next((fix for mode, fix in _MODES.items() if mode in str(m.posMode)), Fix.NONE))
+        _put_position(epoch, m, next((fix for mode, fix in _MODES.items() if mode in str(m.posMode)), Fix.NONE))
 
 
-def _put(epoch: Epoch, m: Any, fix: Fix) -> None:
-    """What GGA and GNS share; height over the ellipsoid is height over the geoid plus the separation."""
+def _put_position(epoch: Epoch, m: Any, fix: Fix) -> None:
+    """What GGA and GNS share. Height over the ellipsoid is height over the geoid plus the separation."""
     station = int(m.diffStation) if str(m.diffStation).isdigit() else None
     prn = station + _NUMBER_TO_PRN if station is not None and station in _SBAS_NUMBERS else station
     if fix is Fix.DIFFERENTIAL and prn in _SBAS_PRNS:
@@ -219,7 +219,7 @@ def _put(epoch: Epoch, m: Any, fix: Fix) -> None:
         epoch.gnss["height_m"] = m.alt + m.sep
 
 
-def _motion(epoch: Epoch, m: Any) -> None:
+def _put_rmc(epoch: Epoch, m: Any) -> None:
     """RMC: velocity; its position and mode count only where neither GGA nor GNS is sent."""
     valid = m.status == "A"
     fix = _MODES.get(getattr(m, "posMode", "") or "A", Fix.NONE) if valid else Fix.NONE
@@ -231,14 +231,14 @@ def _motion(epoch: Epoch, m: Any) -> None:
         epoch.gnss |= {"vel_e_mps": float(speed * np.sin(course)), "vel_n_mps": float(speed * np.cos(course))}
 
 
-def _accuracy(epoch: Epoch, m: Any) -> None:
+def _put_gst(epoch: Epoch, m: Any) -> None:
     """Covariance of a position from its standard deviations."""
     if all(isinstance(value, float) for value in (m.stdLat, m.stdLong, m.stdAlt)):
         epoch.gnss |= {"cov_ee_m2": m.stdLong**2, "cov_nn_m2": m.stdLat**2, "cov_uu_m2": m.stdAlt**2}
-        epoch.gnss |= _correlation(m) | {"cov_eu_m2": 0.0, "cov_nu_m2": 0.0}
+        epoch.gnss |= _gst_correlation(m) | {"cov_eu_m2": 0.0, "cov_nu_m2": 0.0}
 
 
-def _correlation(m: Any) -> dict[str, float]:
+def _gst_correlation(m: Any) -> dict[str, float]:
     """GST gives the error ellipse: its orientation is that of the major axis, from true north."""
     if not all(isinstance(value, float) for value in (m.stdMajor, m.stdMinor, m.orient)):
         return {"cov_en_m2": 0.0}
@@ -252,8 +252,8 @@ _POSITIONS = ("GGA", "GNS", "RMC")
 _WANTED = (b"GGA", b"GNS", b"RMC", b"GST", b"ZDA", b"DTM")
 _NEAR_WGS84 = ("P90", "ETR")
 _DECODERS = {
-    "GGA": _position,
-    "GNS": _position_of_systems,
-    "RMC": _motion,
-    "GST": _accuracy,
+    "GGA": _put_gga,
+    "GNS": _put_gns,
+    "RMC": _put_rmc,
+    "GST": _put_gst,
 }

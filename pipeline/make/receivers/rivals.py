@@ -24,7 +24,7 @@ _DETOUR_M = 2.0
 _DETOUR_SHARE = 0.2
 
 
-class Said(NamedTuple):
+class ToldPosition(NamedTuple):
     """A position as a sentence tells it; `unit_m`: of its last digit. No place: the talker has no fix."""
 
     talker: str
@@ -40,11 +40,11 @@ class Talkers:
     together: Counter[frozenset[str]] = field(default_factory=Counter)
     widest_m: float = 0.0
     fixes: Counter[str] = field(default_factory=Counter)
-    _said: dict[Hashable, Said] = field(default_factory=dict)
+    _said: dict[Hashable, ToldPosition] = field(default_factory=dict)
     _half: Counter[frozenset[str]] = field(default_factory=Counter)
 
-    def taken(self, key: Hashable, said: Said) -> bool:
-        """Whether a position belongs to the epoch of this time, and not to another receiver."""
+    def take_position(self, key: Hashable, said: ToldPosition) -> bool:
+        """Take a position for the epoch of this time; whether it belongs to it, and not to another receiver."""
         self.fixes[said.talker] += said.place is not None
         first = self._said.get(key)
         if first is None or first.talker == said.talker or first.place is None:
@@ -56,13 +56,13 @@ class Talkers:
         if said.place is None:
             self._half[pair] += 1
             return False
-        apart_m = metres(first.place, said.place)
+        apart_m = distance_m(first.place, said.place)
         same = apart_m <= 1.5 * (first.unit_m + said.unit_m)
         (self.together if same else self.apart)[pair] += 1
         self.widest_m = max(self.widest_m, 0.0 if same else apart_m)
         return same
 
-    def latest(self, key: Hashable) -> Said | None:
+    def latest(self, key: Hashable) -> ToldPosition | None:
         """What was said of this time before."""
         return self._said.get(key)
 
@@ -78,38 +78,38 @@ class Talkers:
         return frozenset().union(*differ, *in_turn)
 
 
-def metres(one: tuple[float, float], other: tuple[float, float]) -> float:
+def distance_m(one: tuple[float, float], other: tuple[float, float]) -> float:
     """Distance of two places [deg], near enough for what is asked here."""
     east = (other[1] - one[1]) * math.cos(math.radians(one[0]))
     return math.hypot(other[0] - one[0], (east + 180.0) % 360.0 - 180.0) * _M_PER_DEG
 
 
-def sees_twins(gathered: Gathered) -> float | None:
+def twin_distance_m(gathered: Gathered) -> float | None:
     """How far apart messages of one kind and time are [m], where they are of two receivers; none where they are not."""
-    detours = list(_detours(gathered))
+    detours = list(_pair_distances_m(gathered))
     apart = [apart_m for apart_m, detour_m, bound_m in detours if detour_m > bound_m]
     return max(apart) if len(apart) >= _FEWEST else None
 
 
-def _detours(gathered: Gathered) -> Iterator[tuple[float, float, float]]:
+def _pair_distances_m(gathered: Gathered) -> Iterator[tuple[float, float, float]]:
     """Distance of each pair of one time, and how far the path over the second is longer than the straight one [m]."""
     for one, two in gathered.twins:
-        first, second = _place(one), _place(two)
+        first, second = _position_of(one), _position_of(two)
         later = gathered.epochs[two.number + 1 : two.number + 4]
-        third = next((place for epoch in later if epoch.key != two.key and (place := _place(epoch))), None)
+        third = next((place for epoch in later if epoch.key != two.key and (place := _position_of(epoch))), None)
         if first and second and third:
-            apart_m, straight_m = metres(first, second), metres(first, third)
+            apart_m, straight_m = distance_m(first, second), distance_m(first, third)
             bound_m = max(_DETOUR_M, _DETOUR_SHARE * straight_m)
-            yield apart_m, apart_m + metres(second, third) - straight_m, bound_m
+            yield apart_m, apart_m + distance_m(second, third) - straight_m, bound_m
 
 
-def _place(epoch: Epoch) -> tuple[float, float] | None:
+def _position_of(epoch: Epoch) -> tuple[float, float] | None:
     """Position of an epoch, if it has one."""
     latitude, longitude = epoch.gnss.get("latitude_deg"), epoch.gnss.get("longitude_deg")
     return None if latitude is None or longitude is None else (float(latitude), float(longitude))
 
 
-def two_receivers(place: str, names: frozenset[str], apart_m: float, option: str = "talker") -> InputError:
+def two_receivers_error(place: str, names: frozenset[str], apart_m: float, option: str = "talker") -> InputError:
     """What to do about a log of two receivers; `names`: those that distinguish them."""
     talkers = " and ".join(sorted(names))
     choose = ", ".join(f"--solution {name}" for name in sorted(names))

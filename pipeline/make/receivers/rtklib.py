@@ -61,14 +61,18 @@ def is_solution(content: bytes) -> bool:
 def read_solution(content: bytes, path: Path) -> tuple[dict[Stream, pl.DataFrame], dict[str, int]]:
     """`gnss` of a solution, and what was left out. Raises `InputError` for whatever the header does not explain."""
     lines = content.decode("utf-8", "replace").splitlines()
-    layout = _layout([line for line in lines if line.startswith("%")], path)
-    rows, dropped = _rows(lines, layout, content.endswith((b"\n", b"\r")), path)
+    layout = _read_header([line for line in lines if line.startswith("%")], path)
+    rows, dropped = _split_rows(lines, layout, content.endswith((b"\n", b"\r")), path)
     if not rows:
         raise InputError("holds no epoch", place=str(path), expected="rows below the header")
     words = np.array(rows)
-    frame = pl.DataFrame({"t": _times(words, layout, path), "solution": "primary"})
-    numbers = _numbers(words, layout, path)
-    columns = _place(numbers, layout, path) | _covariance(numbers, layout, path) | _quality(numbers, path)
+    frame = pl.DataFrame({"t": _parse_times(words, layout, path), "solution": "primary"})
+    numbers = _parse_numbers(words, layout, path)
+    columns = (
+        _position_columns(numbers, layout, path)
+        | _covariance_columns(numbers, layout, path)
+        | _fix_columns(numbers, path)
+    )
     if "geodetic" in layout.comments:
         columns["height_m"] = None
         dropped[_GEOID] = len(rows)
@@ -84,7 +88,7 @@ def read_solution(content: bytes, path: Path) -> tuple[dict[Stream, pl.DataFrame
 def parts_of_solution(content: bytes, path: Path) -> list[LogPart]:
     """The columns of a solution, and what they become."""
     lines = content.decode("utf-8", "replace").splitlines()
-    layout = _layout([line for line in lines if line.startswith("%")], path)
+    layout = _read_header([line for line in lines if line.startswith("%")], path)
     rows = sum(bool(line.strip()) and not line.startswith("%") for line in lines)
     parts = [LogPart(path.name, "column", layout.scale, rows, "gnss t")]
     for name in layout.columns:
@@ -103,7 +107,7 @@ _USES = {
 }
 
 
-def _layout(comments: list[str], path: Path) -> _RtklibHeader:
+def _read_header(comments: list[str], path: Path) -> _RtklibHeader:
     """Columns of a file of RTKLIB, of the line that names them."""
     headers = [re.split(r"[\s,;]+", line.lstrip("% ").strip()) for line in comments]
     headers = [words for words in headers if words[0] in _AHEAD_NS and {"Q", "ns"} <= set(words)]
@@ -130,7 +134,9 @@ def _layout(comments: list[str], path: Path) -> _RtklibHeader:
     return _RtklibHeader(scale, names, "\n".join(comments))
 
 
-def _rows(lines: list[str], layout: _RtklibHeader, ended: bool, path: Path) -> tuple[list[list[str]], dict[str, int]]:
+def _split_rows(
+    lines: list[str], layout: _RtklibHeader, ended: bool, path: Path
+) -> tuple[list[list[str]], dict[str, int]]:
     """The words of each row; a last row without its end is left out."""
     rows: list[list[str]] = []
     for number, line in enumerate(lines, 1):
@@ -151,7 +157,7 @@ def _rows(lines: list[str], layout: _RtklibHeader, ended: bool, path: Path) -> t
     return rows, {}
 
 
-def _times(words: Any, layout: _RtklibHeader, path: Path) -> pl.Series:
+def _parse_times(words: Any, layout: _RtklibHeader, path: Path) -> pl.Series:
     """UTC of the first two words of each row."""
     if _DATE.fullmatch(words[0, 0]):
         text = pl.Series(np.char.add(np.char.add(words[:, 0], "T"), words[:, 1]))
@@ -172,7 +178,7 @@ def _times(words: Any, layout: _RtklibHeader, path: Path) -> pl.Series:
     return utc_of(t_ns - _AHEAD_NS[layout.scale], "gps" if layout.scale == "GPST" else "utc")
 
 
-def _numbers(words: Any, layout: _RtklibHeader, path: Path) -> dict[str, Floats]:
+def _parse_numbers(words: Any, layout: _RtklibHeader, path: Path) -> dict[str, Floats]:
     """The columns after date and time, by the names of the header."""
     rest = words[:, 2:]
     try:
@@ -182,7 +188,7 @@ def _numbers(words: Any, layout: _RtklibHeader, path: Path) -> dict[str, Floats]
     return dict(zip(layout.columns, values.T, strict=True))
 
 
-def _place(numbers: dict[str, Floats], layout: _RtklibHeader, path: Path) -> dict[str, Any]:
+def _position_columns(numbers: dict[str, Floats], layout: _RtklibHeader, path: Path) -> dict[str, Any]:
     """Place and, where given, velocity."""
     if "Tokyo" in layout.comments:
         raise InputError("is in the Tokyo datum", place=str(path), expected="WGS 84", remedy="Set out-datum = wgs84.")
@@ -199,10 +205,10 @@ def _place(numbers: dict[str, Floats], layout: _RtklibHeader, path: Path) -> dic
             expected="latitude and longitude, or x/y/z-ecef",
             remedy="Let RTKLIB write latitude, longitude and height (out-solformat = llh).",
         )
-    return place | _velocity(numbers, place)
+    return place | _velocity_columns(numbers, place)
 
 
-def _velocity(numbers: dict[str, Floats], place: dict[str, Floats]) -> dict[str, Any]:
+def _velocity_columns(numbers: dict[str, Floats], place: dict[str, Floats]) -> dict[str, Any]:
     """Velocities to the east, the north and up, however the file states them."""
     if "vx" in numbers:
         turn = east_north_up(place["latitude_deg"], place["longitude_deg"])
@@ -211,7 +217,7 @@ def _velocity(numbers: dict[str, Floats], place: dict[str, Floats]) -> dict[str,
     return {f"vel_{axis}_mps": numbers[f"v{axis}"] for axis in "enu" if f"v{axis}" in numbers}
 
 
-def _covariance(numbers: dict[str, Floats], layout: _RtklibHeader, path: Path) -> dict[str, Any]:
+def _covariance_columns(numbers: dict[str, Floats], layout: _RtklibHeader, path: Path) -> dict[str, Any]:
     """Deviations, and of two axes the signed root of their covariance, as variances [m2]."""
     axes = "xyz" if "sdx" in numbers else "enu"
     matrix = np.zeros((3, 3, len(numbers["Q"])))
@@ -223,7 +229,7 @@ def _covariance(numbers: dict[str, Floats], layout: _RtklibHeader, path: Path) -
                 return {}
             matrix[row, column] = np.sign(numbers[name]) * numbers[name] ** 2
     if axes == "xyz":
-        place = _place(numbers, layout, path)
+        place = _position_columns(numbers, layout, path)
         turn = east_north_up(place["latitude_deg"], place["longitude_deg"])
         matrix = np.einsum("ijn,jkn,lkn->iln", turn, matrix, turn)
     upper = {f"cov_{a}{b}_m2": matrix[i, j] for i, a in enumerate("enu") for j, b in enumerate("enu") if i <= j}
@@ -232,7 +238,7 @@ def _covariance(numbers: dict[str, Floats], layout: _RtklibHeader, path: Path) -
     return {name: pl.Series(values).set(pl.Series(unknown), None) for name, values in upper.items()}
 
 
-def _quality(numbers: dict[str, Floats], path: Path) -> dict[str, Any]:
+def _fix_columns(numbers: dict[str, Floats], path: Path) -> dict[str, Any]:
     """Kind of fix by RTKLIB's quality."""
     strange = [code for code in np.unique(numbers["Q"]) if code not in _QUALITY]
     if strange:

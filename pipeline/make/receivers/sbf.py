@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from pipeline.make.receivers.earth_fixed import east_north_up, geodetic, local_velocity
-from pipeline.make.receivers.epochs import Epoch, Gathered, covariance
+from pipeline.make.receivers.epochs import Epoch, Gathered, covariance_columns
 from pipeline.read.ingest.recipes_drivers import SBF_FIXES
 from pipeline.read.ingest.timescale import utc_of_week
 from schemas.enums import Fix
@@ -35,31 +35,31 @@ def decode(gathered: Gathered, message: Any, raw: bytes) -> None:
     decoder = _DECODERS[message.identity]
     tow_ms, week = struct.unpack_from("<IH", raw, 8)
     if tow_ms == _NO_TOW or week == _NO_WEEK:
-        gathered.drop("time not valid")
+        gathered.count_dropped("time not valid")
         return
     position = message.identity if message.identity in _POSITIONS else ""
-    if position and message.Error == 0 and not _datum(gathered, message):
+    if position and message.Error == 0 and not _has_wgs84_datum(gathered, message):
         return
-    epoch = gathered.at((week, tow_ms), position, raw)
+    epoch = gathered.epoch_at((week, tow_ms), position, raw)
     epoch.t_ns = utc_of_week(week, tow_ms * 1_000_000)
     decoder(epoch, message)
 
 
-def _datum(gathered: Gathered, message: Any) -> bool:
+def _has_wgs84_datum(gathered: Gathered, message: Any) -> bool:
     """Whether a position is of WGS 84 or near to it, which is counted by name; user-defined ones are left out."""
     number = int(getattr(message, "Datum", 0))
     if number in (0, _DATUM_OF_BASE, 255):
         return True
     name = _DATUMS.get(number, f"datum {number}")
     if number in _NEAR_WGS84:
-        gathered.drop(f"position in {name} (kept: decimetres from WGS 84)")
+        gathered.count_dropped(f"position in {name} (kept: decimetres from WGS 84)")
         return True
-    gathered.drop(f"position in another datum than WGS 84 ({name})")
+    gathered.count_dropped(f"position in another datum than WGS 84 ({name})")
     return False
 
 
-def _solution(epoch: Epoch, m: Any) -> bool:
-    """What both PVT blocks share; true where they hold a position."""
+def _put_solution(epoch: Epoch, m: Any) -> bool:
+    """Put down what both PVT blocks share; whether they hold a position."""
     fix = SBF_FIXES.get(m.Type, Fix.NONE) if m.Error == 0 else Fix.NONE
     epoch.gnss |= {"fix": fix.value, "satellites": m.NrSV if m.NrSV != 255 else None}
     # Base stations are numbered too: only an SBAS solution refers to a satellite.
@@ -69,16 +69,18 @@ def _solution(epoch: Epoch, m: Any) -> bool:
     return fix is not Fix.NONE
 
 
-def _geodetic(epoch: Epoch, m: Any) -> None:
+def _put_geodetic(epoch: Epoch, m: Any) -> None:
     """Position and velocity of a PVTGeodetic block."""
-    if _solution(epoch, m) and m.Latitude != _DO_NOT_USE:
+    if _put_solution(epoch, m) and m.Latitude != _DO_NOT_USE:
         place = {"latitude_deg": float(np.degrees(m.Latitude)), "longitude_deg": float(np.degrees(m.Longitude))}
-        epoch.gnss |= place | _known({"height_m": m.Height, "vel_e_mps": m.Ve, "vel_n_mps": m.Vn, "vel_u_mps": m.Vu})
+        epoch.gnss |= place | _without_unknown(
+            {"height_m": m.Height, "vel_e_mps": m.Ve, "vel_n_mps": m.Vn, "vel_u_mps": m.Vu}
+        )
 
 
-def _cartesian(epoch: Epoch, m: Any) -> None:
+def _put_cartesian(epoch: Epoch, m: Any) -> None:
     """Position and velocity of a PVTCartesian block."""
-    if not _solution(epoch, m) or m.X == _DO_NOT_USE:
+    if not _put_solution(epoch, m) or m.X == _DO_NOT_USE:
         return
     place = geodetic(m.X, m.Y, m.Z)
     epoch.gnss |= place
@@ -86,13 +88,15 @@ def _cartesian(epoch: Epoch, m: Any) -> None:
         epoch.gnss |= local_velocity(place["latitude_deg"], place["longitude_deg"], (m.Vx, m.Vy, m.Vz))
 
 
-def _geodetic_covariance(epoch: Epoch, m: Any) -> None:
+def _put_geodetic_covariance(epoch: Epoch, m: Any) -> None:
     """Covariance of a PosCovGeodetic block."""
-    epoch.gnss |= _known(covariance(m.Cov_lonlon, m.Cov_latlon, m.Cov_lonhgt, m.Cov_latlat, m.Cov_lathgt, m.Cov_hgthgt))
+    epoch.gnss |= _without_unknown(
+        covariance_columns(m.Cov_lonlon, m.Cov_latlon, m.Cov_lonhgt, m.Cov_latlat, m.Cov_lathgt, m.Cov_hgthgt)
+    )
 
 
-def _cartesian_covariance(epoch: Epoch, m: Any) -> None:
-    """Turned into east, north, up where the epoch's position is known (SBF writes it first)."""
+def _put_cartesian_covariance(epoch: Epoch, m: Any) -> None:
+    """Covariance turned into east, north, up where the epoch's position is known (SBF writes it first)."""
     latitude = epoch.gnss.get("latitude_deg")
     longitude = epoch.gnss.get("longitude_deg")
     if latitude is None or longitude is None or m.Cov_xx == _DO_NOT_USE:
@@ -102,16 +106,16 @@ def _cartesian_covariance(epoch: Epoch, m: Any) -> None:
         [[m.Cov_xx, m.Cov_xy, m.Cov_xz], [m.Cov_xy, m.Cov_yy, m.Cov_yz], [m.Cov_xz, m.Cov_yz, m.Cov_zz]]
     )
     local = turn @ earth_fixed @ turn.T
-    epoch.gnss |= _known(covariance(*local[np.triu_indices(3)]))
+    epoch.gnss |= _without_unknown(covariance_columns(*local[np.triu_indices(3)]))
 
 
-def _protection(epoch: Epoch, m: Any) -> None:
+def _put_protection_levels(epoch: Epoch, m: Any) -> None:
     """Put down the protection levels of a block."""
-    epoch.gnss |= _known({"hpl_m": m.HPL, "vpl_m": m.VPL})
+    epoch.gnss |= _without_unknown({"hpl_m": m.HPL, "vpl_m": m.VPL})
 
 
-def _known(values: dict[str, float]) -> dict[str, float]:
-    """Septentrio marks what it does not know with -2e10."""
+def _without_unknown(values: dict[str, float]) -> dict[str, float]:
+    """The values that are known: Septentrio marks the others with -2e10."""
     return {name: value for name, value in values.items() if value != _DO_NOT_USE}
 
 
@@ -119,9 +123,9 @@ _BLOCK_NUMBER = 0x1FFF  # the other bits of the id are the revision
 _POSITIONS = ("PVTGeodetic", "PVTCartesian")
 _WANTED = (4001, 4006, 4007, 5905, 5906)
 _DECODERS = {
-    "PVTGeodetic": _geodetic,
-    "PVTCartesian": _cartesian,
-    "PosCovGeodetic": _geodetic_covariance,
-    "PosCovCartesian": _cartesian_covariance,
-    "DOP": _protection,
+    "PVTGeodetic": _put_geodetic,
+    "PVTCartesian": _put_cartesian,
+    "PosCovGeodetic": _put_geodetic_covariance,
+    "PosCovCartesian": _put_cartesian_covariance,
+    "DOP": _put_protection_levels,
 }

@@ -9,7 +9,7 @@ from collections.abc import Callable
 from datetime import UTC, datetime
 from typing import Any
 
-from pipeline.make.receivers.epochs import Gathered, covariance, satellite_name, velocity
+from pipeline.make.receivers.epochs import Gathered, covariance_columns, satellite_name, velocity_columns
 from pipeline.read.ingest.recipes_drivers import UBX_SYSTEMS
 from schemas.arrays import NS_PER_S
 from schemas.enums import Fix
@@ -38,21 +38,21 @@ def parse(raw: bytes) -> Any:
 def decode(gathered: Gathered, message: Any, raw: bytes) -> None:
     """Add what this message says to its epoch, whose key is the time of the week."""
     is_position = message.identity in _POSITIONS
-    epoch = gathered.at(message.iTOW, message.identity if is_position else "", raw)
+    epoch = gathered.epoch_at(message.iTOW, message.identity if is_position else "", raw)
     if is_position:
         epoch.t_ns = _time_ns(message)
         if epoch.t_ns is not None and not getattr(message, "fullyResolved", 1):
-            gathered.drop(_UNRESOLVED)
+            gathered.count_dropped(_UNRESOLVED)
             epoch.unresolved = True
     for what, rank, columns_of in _CONTENTS.get(message.identity, ()):
         if columns := columns_of(message):
-            epoch.put(what, rank, columns)
+            epoch.put_columns(what, rank, columns)
     if message.identity == "NAV-PL" and not message.plPosValid:
-        gathered.drop("protection level not valid")
+        gathered.count_dropped("protection level not valid")
     if message.identity == "NAV-SAT":
-        epoch.satellites = _satellites(message, message.numSvs, 1.0)
+        epoch.satellites = _satellite_rows(message, message.numSvs, 1.0)
     elif message.identity == "NAV-SVINFO" and not epoch.satellites:
-        epoch.satellites = _satellites(message, message.numCh, 1e-2)
+        epoch.satellites = _satellite_rows(message, message.numCh, 1e-2)
 
 
 def settle_times(gathered: Gathered) -> None:
@@ -75,8 +75,8 @@ def settle_times(gathered: Gathered) -> None:
                     resolved += 1
     if resolved:
         left = gathered.dropped.pop(_UNRESOLVED, 0) - resolved
-        gathered.drop(_UNRESOLVED, left)
-        gathered.drop("time not yet resolved (put right by the time of the week)", resolved)
+        gathered.count_dropped(_UNRESOLVED, left)
+        gathered.count_dropped("time not yet resolved (put right by the time of the week)", resolved)
 
 
 def _time_ns(m: Any) -> int | None:
@@ -91,12 +91,12 @@ def _time_ns(m: Any) -> int | None:
     return (int(minute.timestamp()) + second) * NS_PER_S + int(m.nano)
 
 
-def _fix(m: Any) -> Columns:
+def _fix_columns(m: Any) -> Columns:
     """Kind of fix, and number of satellites used."""
-    return {"fix": _kind(m).value, "satellites": m.numSV}
+    return {"fix": _fix_kind(m).value, "satellites": m.numSV}
 
 
-def _kind(m: Any) -> Fix:
+def _fix_kind(m: Any) -> Fix:
     """Kind of fix from `fixType`, the flag that it is within its limits, `diffSoln` and `carrSoln`."""
     good = m.gnssFixOk if hasattr(m, "gnssFixOk") else m.gnssFixOK
     if not good or getattr(m, "invalidLlh", False) or m.fixType in (0, 5):  # none, time only
@@ -108,41 +108,41 @@ def _kind(m: Any) -> Fix:
     return Fix.DIFFERENTIAL if m.diffSoln else Fix.AUTONOMOUS
 
 
-def _place(m: Any) -> Columns:
+def _position_columns(m: Any) -> Columns:
     """Longitude and latitude [deg] and height over the ellipsoid [mm]."""
     return {"latitude_deg": m.lat, "longitude_deg": m.lon, "height_m": m.height / 1e3}
 
 
-def _velocity(m: Any) -> Columns:
+def _velocity_columns(m: Any) -> Columns:
     """Velocity [mm/s]."""
-    return velocity(m.velE / 1e3, m.velN / 1e3, -(m.velD / 1e3))
+    return velocity_columns(m.velE / 1e3, m.velN / 1e3, -(m.velD / 1e3))
 
 
-def _accuracy(m: Any) -> Columns:
-    """`hAcc` is the standard deviation in the plane (half of its variance on each axis), `vAcc` upwards [mm]."""
+def _accuracy_columns(m: Any) -> Columns:
+    """Variances from `hAcc`, the deviation in the plane (half of its variance on each axis), and `vAcc` [mm]."""
     plane = 0.5 * (m.hAcc / 1e3) ** 2
-    return covariance(plane, 0.0, 0.0, plane, 0.0, (m.vAcc / 1e3) ** 2)
+    return covariance_columns(plane, 0.0, 0.0, plane, 0.0, (m.vAcc / 1e3) ** 2)
 
 
-def _stated_covariance(m: Any) -> Columns:
+def _covariance_columns(m: Any) -> Columns:
     """Covariance of a position, if the receiver states one."""
     values = (m.posCovEE, m.posCovNE, -m.posCovED, m.posCovNN, -m.posCovND, m.posCovDD)
-    return covariance(*values) if m.posCovValid else {}
+    return covariance_columns(*values) if m.posCovValid else {}
 
 
-def _protection(m: Any) -> Columns:
-    """plPos1 and plPos2 are the horizontal axes of the ellipsoid, plPos3 the vertical one [mm]."""
+def _protection_columns(m: Any) -> Columns:
+    """Protection levels: plPos1 and plPos2 are the horizontal axes of the ellipsoid, plPos3 the vertical one [mm]."""
     return {"hpl_m": max(m.plPos1, m.plPos2) / 1e3, "vpl_m": m.plPos3 / 1e3} if m.plPosValid else {}
 
 
-def _satellites(m: Any, count: int, residual_m: float) -> list[Columns]:
+def _satellite_rows(m: Any, count: int, residual_m: float) -> list[Columns]:
     """Satellites known and above or below a horizon [deg]; `residual_m`: the unit of the residual."""
     rows: list[Columns] = []
     for index in range(1, count + 1):
         azimuth, elevation, residual, used = (
             getattr(m, f"{name}_{index:02d}") for name in ("azim", "elev", "prRes", "svUsed")
         )
-        name = _name(m, index)
+        name = _satellite_name(m, index)
         if name is not None and abs(float(elevation)) <= 90.0:
             rows.append(
                 {
@@ -156,8 +156,8 @@ def _satellites(m: Any, count: int, residual_m: float) -> list[Columns]:
     return rows
 
 
-def _name(m: Any, index: int) -> str | None:
-    """None for a satellite whose number the receiver does not know (255)."""
+def _satellite_name(m: Any, index: int) -> str | None:
+    """Name of a satellite; None where the receiver does not know its number (255)."""
     if m.identity == "NAV-SVINFO":
         svid = getattr(m, f"svid_{index:02d}")
         known = ((system, svid - low + first) for low, high, system, first in _SVIDS if low <= svid <= high)
@@ -168,13 +168,18 @@ def _name(m: Any, index: int) -> str | None:
 
 
 # What messages say of an epoch, and with which rank: it gives way to a higher one.
-_PVT = (("fix", 0, _fix), ("place", 0, _place), ("velocity", 0, _velocity), ("accuracy", 0, _accuracy))
+_PVT = (
+    ("fix", 0, _fix_columns),
+    ("place", 0, _position_columns),
+    ("velocity", 0, _velocity_columns),
+    ("accuracy", 0, _accuracy_columns),
+)
 _CONTENTS: dict[str, tuple[tuple[str, int, Callable[[Any], Columns]], ...]] = {
     "NAV-PVT": _PVT,
     "NAV-PVAT": _PVT,
-    "NAV-HPPOSLLH": (("place", 1, lambda m: {} if m.invalidLlh else _place(m)),),
-    "NAV-COV": (("accuracy", 1, _stated_covariance),),
-    "NAV-PL": (("protection", 0, _protection),),
+    "NAV-HPPOSLLH": (("place", 1, lambda m: {} if m.invalidLlh else _position_columns(m)),),
+    "NAV-COV": (("accuracy", 1, _covariance_columns),),
+    "NAV-PL": (("protection", 0, _protection_columns),),
     "NAV-SBAS": (("sbas", 0, lambda m: {"sbas_prn": m.geo} if m.geo and m.mode else {}),),
 }
 _POSITIONS = ("NAV-PVT", "NAV-PVAT")

@@ -25,7 +25,7 @@ _DEEPEST = 3  # archives in archives; one that holds itself has no end
 
 
 @contextmanager
-def unpacked(log: Path, config: IngestConfig) -> Iterator[list[Path]]:
+def unpacked_logs(log: Path, config: IngestConfig) -> Iterator[list[Path]]:
     """The logs that a file holds: itself, or what it is the archive of; gone after the block.
 
     A folder is one log (a bag of ROS 2), in an archive as well. Errors name the archive, not where it was unpacked.
@@ -36,17 +36,17 @@ def unpacked(log: Path, config: IngestConfig) -> Iterator[list[Path]]:
         return
     with scratch_folder() as folder:
         try:
-            yield _all_logs(log, folder, Budget(str(log), log.stat().st_size, config))
+            yield _unpack_all(log, folder, Budget(str(log), log.stat().st_size, config))
         except InputError as error:
             error.place = str(error.place).replace(str(folder), str(log))
             raise
 
 
-def _all_logs(log: Path, place: Path, budget: Budget) -> list[Path]:
+def _unpack_all(log: Path, place: Path, budget: Budget) -> list[Path]:
     """All logs within an archive, archives within it included."""
     try:
         _unpack(log, place, budget)
-        return [inner for entry in sorted(place.iterdir()) for inner in _logs(entry, _DEEPEST, budget)]
+        return [inner for entry in sorted(place.iterdir()) for inner in _logs_at(entry, _DEEPEST, budget)]
     except UNPACKING as error:
         raise InputError(
             f"cannot be unpacked: {error}",
@@ -72,7 +72,7 @@ def _unpack_zip(archive: Path, place: Path, budget: Budget) -> None:
         for entry in opened.infolist():
             if not entry.is_dir():
                 with opened.open(entry) as packed:
-                    _write(packed, entry.filename, place, budget)
+                    _write_unpacked(packed, entry.filename, place, budget)
 
 
 def _unpack_tar(archive: Path, place: Path, budget: Budget) -> None:
@@ -81,29 +81,30 @@ def _unpack_tar(archive: Path, place: Path, budget: Budget) -> None:
         for entry in opened:
             packed = opened.extractfile(entry) if entry.isreg() else None
             if packed is not None:
-                _write(packed, entry.name, place, budget)
+                _write_unpacked(packed, entry.name, place, budget)
             elif not entry.isdir():
                 raise OSError(f"{entry.name} is no regular file")
 
 
-def _unpack_one(opener: Callable[[Path], Any]) -> Callable[[Path, Path, Budget], None]:
+def _single_file_unpacker(opener: Callable[[Path], Any]) -> Callable[[Path, Path, Budget], None]:
     """Unpack a format of one single file, which is called as the archive without its last suffix."""
 
     def unpack(archive: Path, place: Path, budget: Budget) -> None:
+        """Unpack the file of an archive, without the archive's last suffix."""
         name = archive.stem + (".tar" if archive.suffix.lower() == ".tgz" else "")
         with opener(archive) as packed:
-            _write(packed, name, place, budget)
+            _write_unpacked(packed, name, place, budget)
 
     return unpack
 
 
-def opened_zstd(packed: Any) -> Any:
-    """The content of a path, or of something that can be read."""
+def open_zstd(packed: Any) -> Any:
+    """The unpacked content of a path, or of something that can be read."""
     source = pa.OSFile(str(packed)) if isinstance(packed, Path) else packed
     return pa.CompressedInputStream(source, "zstd")
 
 
-def _write(packed: IO[bytes], name: str, place: Path, budget: Budget) -> None:
+def _write_unpacked(packed: IO[bytes], name: str, place: Path, budget: Budget) -> None:
     """Unpack one file to where its name says, which must lie within the archive and be no other's."""
     parts = re.split(r"[/\\]", name.removeprefix("./"))
     if {"", ".", ".."} & set(parts) or ":" in name:
@@ -119,15 +120,15 @@ def _write(packed: IO[bytes], name: str, place: Path, budget: Budget) -> None:
 _UNPACKERS: dict[str, Callable[[Path, Path, Budget], None]] = {
     ".zip": _unpack_zip,
     ".tar": _unpack_tar,
-    ".gz": _unpack_one(gzip.open),
-    ".tgz": _unpack_one(gzip.open),
-    ".bz2": _unpack_one(bz2.open),
-    ".xz": _unpack_one(lzma.open),
-    ".zst": _unpack_one(opened_zstd),
+    ".gz": _single_file_unpacker(gzip.open),
+    ".tgz": _single_file_unpacker(gzip.open),
+    ".bz2": _single_file_unpacker(bz2.open),
+    ".xz": _single_file_unpacker(lzma.open),
+    ".zst": _single_file_unpacker(open_zstd),
 }
 
 
-def _logs(path: Path, deeper: int, budget: Budget) -> Iterator[Path]:
+def _logs_at(path: Path, deeper: int, budget: Budget) -> Iterator[Path]:
     """The logs at a place of an archive; what the makers of archives leave in them is none."""
     if path.name.startswith((".", "__MACOSX")):
         return
@@ -142,6 +143,6 @@ def _logs(path: Path, deeper: int, budget: Budget) -> Iterator[Path]:
         deeper -= 1
     if path.is_dir() and not (path / BAG_FOLDER).exists():
         for inner in sorted(path.iterdir()):
-            yield from _logs(inner, deeper, budget)
+            yield from _logs_at(inner, deeper, budget)
         return
     yield path

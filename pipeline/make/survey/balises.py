@@ -32,7 +32,7 @@ def balises_every(network: SurveyNetwork, spacing_m: float, travel: TravelAlong)
     from the survey's start, back to it, or both.
     """
     track = track_of(network.track)
-    from_start = _from_start_m(network.ends, track.length_m)
+    from_start = _distances_from_start_m(network.ends, track.length_m)
     rows: list[dict[str, Any]] = []
     for element, name in enumerate(track.ids):
         at_start, at_end = from_start[network.ends[element]]
@@ -43,21 +43,23 @@ def balises_every(network: SurveyNetwork, spacing_m: float, travel: TravelAlong)
         )
         away = bool(at_start <= at_end)
         measures = chainage_m - begins if away else length - (chainage_m - begins)
-        side = {"netelement_id": name, "direction": _direction(away, travel).value}
+        side = {"netelement_id": name, "direction": _valid_direction(away, travel).value}
         rows += [{**side, "measure_m": float(measure)} for measure in np.clip(measures, 0.0, length)]
     ids = [f"VB{number:0{len(str(len(rows)))}}" for number in range(1, len(rows) + 1)]
     table = pl.DataFrame(rows, schema={"netelement_id": pl.String, "direction": pl.String, "measure_m": pl.Float64})
-    return _typed("balises", table.with_columns(pl.Series("balise_id", ids, dtype=pl.String), kind=pl.lit("virtual")))
+    return _cast_balises(
+        "balises", table.with_columns(pl.Series("balise_id", ids, dtype=pl.String), kind=pl.lit("virtual"))
+    )
 
 
-def _direction(away: bool, travel: TravelAlong) -> BaliseDirection:
-    """Along a net element whose measure grows away from the survey's start, or towards it."""
+def _valid_direction(away: bool, travel: TravelAlong) -> BaliseDirection:
+    """The direction in which a balise is valid, on a net element that grows `away` from the survey's start or not."""
     if travel is TravelAlong.BOTH:
         return BaliseDirection.BOTH
     return BaliseDirection.AB if away == (travel is TravelAlong.AHEAD) else BaliseDirection.BA
 
 
-def _typed(place: str, table: pl.DataFrame) -> pl.DataFrame:
+def _cast_balises(place: str, table: pl.DataFrame) -> pl.DataFrame:
     """A list of balises in the types of a site."""
     breaches: list[str] = []
     typed = typed_table(RawTable(place, table), "balises", breaches)
@@ -68,7 +70,7 @@ def _typed(place: str, table: pl.DataFrame) -> pl.DataFrame:
     return Balises.validate(typed, cast=True)
 
 
-def _from_start_m(ends: np.ndarray, length_m: np.ndarray) -> np.ndarray:
+def _distances_from_start_m(ends: np.ndarray, length_m: np.ndarray) -> np.ndarray:
     """Distance of each node from the start of the first element of its part of the network."""
     count = int(ends.max()) + 1
     pairs = np.sort(ends, axis=1)
@@ -94,11 +96,11 @@ def balises_of_list(
     table = placed_table(place, content_of_survey(path, config.survey), epsg, config.site)
     track = track_of(network.track)
     table = _with_names_and_kinds(table, survey)
-    placer = _Placer(place, network, track, survey, config.survey)
-    places = [placer.placed(row) for row in table.iter_rows(named=True)]
+    placer = _BalisePlacer(place, network, track, survey, config.survey)
+    places = [placer.place_row(row) for row in table.iter_rows(named=True)]
     columns = {"netelement_id": pl.String, "measure_m": pl.Float64}
     placed = pl.DataFrame(places, schema=columns, orient="row")
-    return _typed(place, table.with_columns(placed))
+    return _cast_balises(place, table.with_columns(placed))
 
 
 def _with_names_and_kinds(table: pl.DataFrame, survey: Survey) -> pl.DataFrame:
@@ -120,7 +122,7 @@ def _with_names_and_kinds(table: pl.DataFrame, survey: Survey) -> pl.DataFrame:
     return table.with_columns(kind=kind.fill_null("virtual"))
 
 
-class _Placer:
+class _BalisePlacer:
     """Where on the track a row of a list is."""
 
     def __init__(
@@ -134,7 +136,7 @@ class _Placer:
         self.ground = network_of(track, network.links)
         self.everywhere = segments_of(track).search_in()
 
-    def placed(self, row: dict[str, Any]) -> tuple[str, float]:
+    def place_row(self, row: dict[str, Any]) -> tuple[str, float]:
         """Net element and measure [m] of a row: as given, by coordinates, or by line kilometre."""
         filled = {key for key, value in row.items() if value is not None}
         if {"netelement_id", "measure_m"} <= filled:
@@ -144,9 +146,9 @@ class _Placer:
         if "line_km" in filled:
             return self._at_kilometre(row)
         expected = "latitude_deg and longitude_deg (or x_m and y_m), line_km, or netelement_id and measure_m"
-        raise self._refusal(row, "has no place", expected=expected)
+        raise self._balise_error(row, "has no place", expected=expected)
 
-    def _refusal(self, row: dict[str, Any], message: str, **details: str) -> SiteError:
+    def _balise_error(self, row: dict[str, Any], message: str, **details: str) -> SiteError:
         """The error for a balise."""
         return SiteError(message, place=f"{self.place}: balise {row['balise_id']}", **details)
 
@@ -161,7 +163,7 @@ class _Placer:
             ranked = [candidate for candidate in ranked if self.track.ids[candidate[1]] == wanted]
         if not ranked or ranked[0][0] > far_m:
             nearest = f"{ranked[0][0]:.1f} m" if ranked else f"none within {2 * far_m:g} m"
-            raise self._refusal(row, "lies beside the track", found=nearest, expected=f"at most {far_m:g} m")
+            raise self._balise_error(row, "lies beside the track", found=nearest, expected=f"at most {far_m:g} m")
         self._report_rival(row, ranked)
         return self.track.ids[ranked[0][1]], ranked[0][2]
 
@@ -188,11 +190,11 @@ class _Placer:
         ]
         if not hits:
             expected = "a line kilometre of the survey, not one that it jumps over"
-            raise self._refusal(row, f"no track has line kilometre {km:g}", expected=expected)
+            raise self._balise_error(row, f"no track has line kilometre {km:g}", expected=expected)
         # A joint is the end of one element and the start of the next: one place.
         inner = [hit for hit in hits if hit[1] > 0] or hits
         if len(inner) > 1:
             places = ", ".join(f"{name} at {measure:.1f} m" for name, measure in sorted(inner))
             remedy = "Name netelement_id in the list; where one element has it twice, give measure_m too."
-            raise self._refusal(row, f"line kilometre {km:g} is on {places}", remedy=remedy)
+            raise self._balise_error(row, f"line kilometre {km:g} is on {places}", remedy=remedy)
         return inner[0]

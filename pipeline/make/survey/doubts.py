@@ -17,18 +17,18 @@ from schemas.config import SiteConfig, SurveyConfig
 from schemas.run import Finding
 
 
-def doubts(network: SurveyNetwork, config: SurveyConfig, site: SiteConfig) -> list[Finding]:
+def find_doubts(network: SurveyNetwork, config: SurveyConfig, site: SiteConfig) -> list[Finding]:
     """Kinks, tracks that were surveyed twice, open ends next to other track, heights and kilometres that do not fit."""
     track = track_of(network.track)
     in_parts = network_of(in_pieces(track), network.links)
-    findings = [*_heights(network.elements), *_doubled(in_parts, config)]
-    findings += _open_ends(network_of(track, network.links), config.same_track_m, site.near_ends_m)
+    findings = [*_missing_heights(network.elements), *_tracks_twice(in_parts, config)]
+    findings += _ends_beside_track(network_of(track, network.links), config.same_track_m, site.near_ends_m)
     for element in network.elements:
-        findings += [*_kinks(element, config), *_kilometres(element, config)]
+        findings += [*_kinks(element, config), *_kilometre_jumps(element, config)]
     return findings
 
 
-def _heights(elements: list[LinePiece]) -> Iterator[Finding]:
+def _missing_heights(elements: list[LinePiece]) -> Iterator[Finding]:
     """Points without height."""
     flat = [np.isnan(element.height_m).all() for element in elements]
     if all(flat):
@@ -57,12 +57,12 @@ def _kinks(element: LinePiece, config: SurveyConfig) -> Iterator[Finding]:
     kinks = np.flatnonzero(aside & (sharp | (turn > np.radians(config.kink_deg))))
     if len(kinks):
         worst = kinks[int(np.argmax(turn[kinks]))] + 1
-        sharpest = f"{np.degrees(turn[worst - 1]):.0f} degrees at {element.place(worst)}"
+        sharpest = f"{np.degrees(turn[worst - 1]):.0f} degrees at {element.place_words(worst)}"
         text = f"{len(kinks)} kinks; the sharpest turns by {sharpest}"
         yield Finding("warning", f"track: {element.name}", text, "Look whether a point is wrong or out of order.")
 
 
-def _kilometres(element: LinePiece, config: SurveyConfig) -> Iterator[Finding]:
+def _kilometre_jumps(element: LinePiece, config: SurveyConfig) -> Iterator[Finding]:
     """Jumps of the kilometres against the length of the track."""
     distance_m = distance_along_m(element.surface)
     known, off_m, jumps = kilometre_spans(element.line_km, distance_m, config)
@@ -77,7 +77,7 @@ def _kilometres(element: LinePiece, config: SurveyConfig) -> Iterator[Finding]:
         yield Finding("warning", f"track: {element.name}", text, "A jump of the kilometres, or points out of order.")
 
 
-def _doubled(ground: Network, config: SurveyConfig) -> Iterator[Finding]:
+def _tracks_twice(ground: Network, config: SurveyConfig) -> Iterator[Finding]:
     """Tracks that lie on each other; an element that turns back is in pieces, which are compared like others."""
     track = ground.track
     along = places_along(track, SAMPLE_SPACING_M)
@@ -97,8 +97,11 @@ def _doubled(ground: Network, config: SurveyConfig) -> Iterator[Finding]:
             yield Finding("warning", f"track: {track.ids[first]}", text, "Look whether one track was surveyed twice.")
 
 
-def _open_ends(ground: Network, same_track_m: float, near_ends_m: float) -> Iterator[Finding]:
-    """Ends that lie next to the middle of another element: a switch without its node. Ends near ends: `site.checks`."""
+def _ends_beside_track(ground: Network, same_track_m: float, near_ends_m: float) -> Iterator[Finding]:
+    """Ends that lie next to the middle of another element: a switch without its node.
+
+    Ends near ends: `site.checks`.
+    """
     track = ground.track
     element, position = np.nonzero(~ground.have_successors())
     row = np.where(position == 0, track.first[element], track.first[element + 1] - 1)

@@ -41,11 +41,11 @@ def read_geojson(place: str, stem: str, data: bytes, config: SiteConfig, id_fiel
     try:
         document = json.loads(data)
         if "features" not in document and "elements" in document:
-            return survey_of_features(place, stem, list(_of_overpass(place, document["elements"])), id_field)
+            return survey_of_features(place, stem, list(_overpass_features(place, document["elements"])), id_field)
         items = document["features"]
         if has_relations(items):
-            return _of_network(place, data, config)
-        features = [_feature(item) for item in items]
+            return _network_survey(place, data, config)
+        features = [_tags_and_geometry(item) for item in items]
     except (KeyError, TypeError, ValueError, RecursionError) as error:
         message = f"is not a GeoJSON FeatureCollection ({type(error).__name__}: {error})"
         raise SiteError(message, place=place, remedy="Overpass exports GeoJSON under Export.") from None
@@ -55,7 +55,7 @@ def read_geojson(place: str, stem: str, data: bytes, config: SiteConfig, id_fiel
     return survey
 
 
-def _of_overpass(place: str, elements: list[Any]) -> Iterator[Feature]:
+def _overpass_features(place: str, elements: list[Any]) -> Iterator[Feature]:
     """Ways and tagged nodes of Overpass JSON; places of a way stand in its `geometry` (`out geom`) or in its nodes."""
     nodes = {item["id"]: [item["lon"], item["lat"]] for item in elements if item["type"] == "node"}
     for item in elements:
@@ -78,19 +78,19 @@ def survey_of_features(place: str, stem: str, features: list[Feature], id_field:
     _require_field(place, features, id_field)
     ids = _IDS if id_field is None else (id_field,)
     survey = Survey()
-    kinds = {_kind(tags) for tags, geometry in features if next(_lines(geometry), None) is not None}
+    kinds = {_railway_kind(tags) for tags, geometry in features if next(_lines_of_geometry(geometry), None) is not None}
     railways = any(tags.get("railway") is not None for tags, _ in features)
     used = set(_IN_USE) - ({_TRAM} if "rail" in kinds else set())
     left_out: Counter[str] = Counter()
     for number, (tags, geometry) in enumerate(features):
-        kind = _kind(tags) if railways else "line"
-        lines = list(_lines(geometry))
+        kind = _railway_kind(tags) if railways else "line"
+        lines = list(_lines_of_geometry(geometry))
         if geometry.get("type") == "Point" and kind in (*_CROSSINGS, "switch"):
-            longitude, latitude, _ = _numbers(f"{place}: feature {number}", geometry.get("coordinates"))
+            longitude, latitude, _ = _coordinates(f"{place}: feature {number}", geometry.get("coordinates"))
             (survey.switches_deg if kind == "switch" else survey.crossings_deg).append((latitude, longitude))
         elif lines and (not railways or kind in used):
             name = next((str(tags[key]).strip() for key in ids if tags.get(key) not in (None, "")), stem)
-            survey.pieces += [_piece(f"{place}: feature {number}", name, line) for line in lines]
+            survey.pieces += [_line_piece(f"{place}: feature {number}", name, line) for line in lines]
         elif lines:
             left_out[kind] += 1
     for kind, count in sorted(left_out.items()):
@@ -100,7 +100,7 @@ def survey_of_features(place: str, stem: str, features: list[Feature], id_field:
     return survey
 
 
-def _of_network(place: str, data: bytes, config: SiteConfig) -> Survey:
+def _network_survey(place: str, data: bytes, config: SiteConfig) -> Survey:
     """Net elements whole, with the relations that the network gives between their ends."""
     breaches: list[str] = []
     network = read_network(place, data, breaches)
@@ -130,12 +130,12 @@ def _require_field(place: str, features: list[Feature], id_field: str | None) ->
     raise SiteError("has no such attribute", place=f"{place}: --id {id_field}", expected=f"one of {', '.join(known)}")
 
 
-def _kind(tags: Mapping[str, Any]) -> str:
+def _railway_kind(tags: Mapping[str, Any]) -> str:
     """The value of `railway`; a railway out of use may have a tag of its own for that."""
     return next((key for key in ("disused", "abandoned") if tags.get(key) == "yes"), str(tags.get("railway")))
 
 
-def _feature(item: Any) -> Feature:
+def _tags_and_geometry(item: Any) -> Feature:
     """Tags and geometry; some programs put tags into a property of their own."""
     properties, geometry = parts_of(item)
     nested = properties.get("tags")
@@ -145,7 +145,7 @@ def _feature(item: Any) -> Feature:
     return tags, geometry
 
 
-def _lines(geometry: Mapping[str, Any]) -> Iterator[Any]:
+def _lines_of_geometry(geometry: Mapping[str, Any]) -> Iterator[Any]:
     """Lines of a geometry."""
     coordinates = geometry.get("coordinates")
     if geometry.get("type") == "LineString":
@@ -154,16 +154,16 @@ def _lines(geometry: Mapping[str, Any]) -> Iterator[Any]:
         yield from coordinates
 
 
-def _piece(place: str, name: str, line: Any) -> Any:
+def _line_piece(place: str, name: str, line: Any) -> Any:
     """A piece of track from the coordinates of a line."""
     if not isinstance(line, list):
         raise SiteError("coordinates are no list", place=place)
-    triples = [_numbers(place, point) for point in line]
+    triples = [_coordinates(place, point) for point in line]
     longitude, latitude, height = zip(*triples, strict=True) if triples else ((), (), ())
     return piece_of(place, name, {"latitude_deg": latitude, "longitude_deg": longitude, "height_m": height})
 
 
-def _numbers(place: str, point: Any) -> tuple[float, float, float | None]:
+def _coordinates(place: str, point: Any) -> tuple[float, float, float | None]:
     """Longitude, latitude and height of a point."""
     try:
         return triple(point)

@@ -10,7 +10,7 @@ import numpy as np
 import polars as pl
 
 from pipeline.make.survey.balises import balises_every, balises_of_list
-from pipeline.make.survey.doubts import doubts
+from pipeline.make.survey.doubts import find_doubts
 from pipeline.make.survey.network import SurveyNetwork, make_network
 from pipeline.make.survey.pieces import Survey
 from pipeline.make.survey.sources import read_surveys
@@ -32,7 +32,7 @@ _FILES = ("track", "links", "balises", "route")
 
 
 @frozen
-class Wish:
+class SiteRequest:
     """What a site is made of: balises every so many metres or of a list; ends this near [m] meet.
 
     `travel`: for which direction of travel those every so many metres are valid. `id_field`: attribute of maps that
@@ -50,7 +50,7 @@ class Wish:
     sigma_m: float | None = None
 
 
-def wish_of(
+def site_request(
     surveys: list[Path],
     balises: str | None,
     epsg: int | None,
@@ -59,16 +59,16 @@ def wish_of(
     travel: TravelAlong = TravelAlong.BOTH,
     id_field: str | None = None,
     sigma_m: float | None = None,
-) -> Wish:
+) -> SiteRequest:
     """The words of the command; `--balises every 1000` leaves its number among the surveys. Raises `UsageError`."""
     words = [str(path) for path in surveys]
     spacing: float | None = None
     if balises is not None and balises.startswith("every"):
         text = balises.removeprefix("every").strip(" =:")
         if not text:
-            text = next((word for word in words if _number(word) is not None and not Path(word).exists()), "")
+            text = next((word for word in words if _number_or_none(word) is not None and not Path(word).exists()), "")
             surveys = [path for path in surveys if str(path) != text]
-        spacing = _number(text.removesuffix("m"))
+        spacing = _number_or_none(text.removesuffix("m"))
         if spacing is None or not 1.0 <= spacing <= 1e6:
             raise UsageError("is no spacing", place=f"--balises {balises}", expected="every 1000 (metres)")
     if not surveys:
@@ -79,10 +79,10 @@ def wish_of(
     if sigma_m is not None and not 0.0 < sigma_m < math.inf:
         raise UsageError("is no standard deviation", place=f"--sigma {sigma_m:g}", expected="metres, more than 0")
     balise_list = None if spacing or balises is None else Path(balises)
-    return Wish(surveys, spacing, travel, balise_list, epsg, join_m, flat, id_field, sigma_m)
+    return SiteRequest(surveys, spacing, travel, balise_list, epsg, join_m, flat, id_field, sigma_m)
 
 
-def make_site(wish: Wish, vehicle: Vehicle, config: Configuration) -> Site:
+def make_site(wish: SiteRequest, vehicle: Vehicle, config: Configuration) -> Site:
     """The site of surveys, with findings of the survey and of the site itself. `track` has `line_km` besides.
 
     Raises `SiteError`, `UsageError`.
@@ -98,7 +98,7 @@ def make_site(wish: Wish, vehicle: Vehicle, config: Configuration) -> Site:
     network = make_network(survey, wish.join_m, config.survey)
     if not network.elements:
         raise SiteError("nothing is left of the survey", place=", ".join(map(str, wish.surveys)))
-    balises = _balises(wish, network, survey, config)
+    balises = _requested_balises(wish, network, survey, config)
     track = network.track
     remarked = remarks(track_of(track), network.links, balises, None, survey.declared_m, config.site)
     if remarked.breaches:
@@ -108,14 +108,16 @@ def make_site(wish: Wish, vehicle: Vehicle, config: Configuration) -> Site:
     findings = (
         *ambiguities(site, config),
         *survey.findings,
-        *doubts(network, config.survey, config.site),
+        *find_doubts(network, config.survey, config.site),
         *remarked.findings,
         *without_balises(balises),
     )
     return replace(site, findings=findings)
 
 
-def _balises(wish: Wish, network: SurveyNetwork, survey: Survey, config: Configuration) -> pl.DataFrame | None:
+def _requested_balises(
+    wish: SiteRequest, network: SurveyNetwork, survey: Survey, config: Configuration
+) -> pl.DataFrame | None:
     """Balises at a spacing or from a list, whichever is wished."""
     if wish.spacing_m is not None:
         table = balises_every(network, wish.spacing_m, wish.travel)
@@ -123,7 +125,7 @@ def _balises(wish: Wish, network: SurveyNetwork, survey: Survey, config: Configu
     return None if wish.balise_list is None else balises_of_list(wish.balise_list, network, wish.epsg, survey, config)
 
 
-def write_made(site: Site, page: str, out: Path, force: bool) -> None:
+def write_site(site: Site, page: str, out: Path, force: bool) -> None:
     """The site as Parquet and its page; a site that is there stays, unless `force`. Raises `UsageError`."""
     there = [name for name in _FILES for suffix in ("parquet", "csv", "geojson") if (out / f"{name}.{suffix}").exists()]
     if there and not force:
@@ -140,7 +142,8 @@ def write_made(site: Site, page: str, out: Path, force: bool) -> None:
     replace_files(out, {**contents, **written, **companions}, marker="track.parquet")
 
 
-def _number(text: str) -> float | None:
+def _number_or_none(text: str) -> float | None:
+    """The number that a text is; None where it is none."""
     try:
         return float(text)
     except ValueError:

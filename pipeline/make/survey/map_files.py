@@ -41,13 +41,13 @@ def read_map(path: Path, data: bytes, config: SurveyConfig, id_field: str | None
     if not data.startswith(_BEGINNINGS[path.suffix.lower()]):
         raise SiteError(f"is no {path.suffix} file", place=str(path), found=repr(data[:16]))
     try:
-        with _copied(path, data, config) as copy:
+        with _copied_map(path, data, config) as copy:
             layers = [str(layer) for layer, _ in pyogrio.list_layers(copy.file)]
-            _refuse_computed(copy.file, layers)
+            _refuse_views(copy.file, layers)
             # Room is made for as many as the file declares; each takes some bytes of it.
             if sum(abs(pyogrio.read_info(copy.file, layer=layer)["features"]) for layer in layers) > copy.size_bytes:
                 raise ValueError("it declares more features than it has bytes")
-            features = [feature for layer in layers for feature in _features(copy.file, layer)]
+            features = [feature for layer in layers for feature in _layer_features(copy.file, layer)]
     except (ValueError, RuntimeError, OSError, struct.error, sqlite3.Error) as error:
         raise SiteError(f"cannot be read ({str(error).splitlines()[0]})", place=str(path)) from None
     return survey_of_features(str(path), path.stem, features, id_field)
@@ -61,7 +61,7 @@ class _Copy(NamedTuple):
 
 
 @contextmanager
-def _copied(path: Path, data: bytes, config: SurveyConfig) -> Iterator[_Copy]:
+def _copied_map(path: Path, data: bytes, config: SurveyConfig) -> Iterator[_Copy]:
     """Copies alone are read: what GDAL opens beside a map is what was noted, and it leaves no file beside the map."""
     with scratch_folder() as folder:
         file = folder / f"map{path.suffix.lower()}"
@@ -80,8 +80,8 @@ def _companion(path: Path, ending: str) -> Path:
     return path.with_suffix(ending) if ending.startswith(".") else path.with_name(path.name + ending)
 
 
-def _refuse_computed(path: Path, layers: list[str]) -> None:
-    """A layer of a GeoPackage may be a query over nothing that never ends; a survey is a table."""
+def _refuse_views(path: Path, layers: list[str]) -> None:
+    """Refuse a layer of a GeoPackage that is a query: it may never end; a survey is a table."""
     if path.suffix.lower() != ".gpkg":
         return
     with closing(sqlite3.connect(f"{path.resolve().as_uri()}?mode=ro", uri=True)) as database:
@@ -90,7 +90,7 @@ def _refuse_computed(path: Path, layers: list[str]) -> None:
         raise ValueError(f"its layer {layer} is a view; expected a table: export it as a file of its own")
 
 
-def _features(path: Path, layer: str) -> Iterator[Feature]:
+def _layer_features(path: Path, layer: str) -> Iterator[Feature]:
     """Tags and geometry of the layer's features, as GeoJSON has them."""
     from pyogrio import raw
 
@@ -98,19 +98,19 @@ def _features(path: Path, layer: str) -> Iterator[Feature]:
     names = [str(name) for name in meta["fields"]]
     for row, shape in enumerate(() if shapes is None else shapes):
         if shape is not None:
-            tags = {name: _plain(column[row]) for name, column in zip(names, values, strict=True)}
-            lines = [_in_degrees(line, meta["crs"]).tolist() for line in lines_of_wkb(memoryview(shape))]
+            tags = {name: _plain_value(column[row]) for name, column in zip(names, values, strict=True)}
+            lines = [_line_in_degrees(line, meta["crs"]).tolist() for line in lines_of_wkb(memoryview(shape))]
             point = len(lines) == 1 and len(lines[0]) == 1
             kind, coordinates = ("Point", lines[0][0]) if point else ("MultiLineString", lines)
             yield tags, {"type": kind, "coordinates": coordinates}
 
 
-def _plain(value: Any) -> Any:
+def _plain_value(value: Any) -> Any:
     """A value without its type of numpy."""
     return value.item() if isinstance(value, np.generic) else value
 
 
-def _in_degrees(line: npt.NDArray[np.float64], crs: str | None) -> npt.NDArray[np.float64]:
+def _line_in_degrees(line: npt.NDArray[np.float64], crs: str | None) -> npt.NDArray[np.float64]:
     """Longitude, latitude and, where the line has them, heights as they stand."""
     if crs is None:
         raise ValueError("no coordinate system is named; expected one, as in a .prj file")

@@ -54,24 +54,24 @@ def make_network(survey: Survey, join_m: float | None, config: SurveyConfig) -> 
         survey.report("note", "survey", f"{short} lines with fewer than two points are left out")
     if not pieces:
         return _NOTHING
-    nodes = _nodes(pieces, config.same_place_m if join_m is None else join_m, survey.relations)
+    nodes = _node_numbers(pieces, config.same_place_m if join_m is None else join_m, survey.relations)
     if pieces[0].whole:
         ends = np.array([piece_nodes[[0, -1]] for piece_nodes in nodes])
-        return _linked(pieces, ends, set(), set(), survey, config)
-    pieces, nodes = _without_doubles(pieces, nodes, survey)
+        return _with_links(pieces, ends, set(), set(), survey, config)
+    pieces, nodes = _without_repeated_stretches(pieces, nodes, survey)
     if not pieces:
         return _NOTHING
     switches = _nodes_at(pieces, nodes, survey.switches_deg, config)
-    crossings = _crossings(pieces, nodes, switches, survey, config)
-    return _linked(*_cut(pieces, nodes, crossings), crossings, switches, survey, config)
+    crossings = _crossing_nodes(pieces, nodes, switches, survey, config)
+    return _with_links(*_cut_at_nodes(pieces, nodes, crossings), crossings, switches, survey, config)
 
 
-def _linked(
+def _with_links(
     elements: list[LinePiece], ends: Ints, crossings: set[int], switches: set[int], survey: Survey, config: SurveyConfig
 ) -> SurveyNetwork:
     """A network with its links between net elements."""
     track = _track_table(elements)
-    return SurveyNetwork(elements, ends, _links(track, ends, crossings, switches, survey, config), track)
+    return SurveyNetwork(elements, ends, _link_table(track, ends, crossings, switches, survey, config), track)
 
 
 def _track_table(elements: list[LinePiece]) -> pl.DataFrame:
@@ -82,7 +82,7 @@ def _track_table(elements: list[LinePiece]) -> pl.DataFrame:
     return pl.DataFrame({"netelement_id": names, "measure_m": np.concatenate(measures), **columns}, nan_to_null=True)
 
 
-def _nodes(pieces: list[LinePiece], join_m: float, relations: list[Relation]) -> list[Ints]:
+def _node_numbers(pieces: list[LinePiece], join_m: float, relations: list[Relation]) -> list[Ints]:
     """A number per point; points that are one node have the same: near each other, or joined by a relation."""
     latitude = np.concatenate([piece.latitude_deg for piece in pieces])
     longitude = np.concatenate([piece.longitude_deg for piece in pieces])
@@ -91,7 +91,7 @@ def _nodes(pieces: list[LinePiece], join_m: float, relations: list[Relation]) ->
     node = np.unique(keys, axis=0, return_inverse=True)[1].ravel()
     piece_of = np.repeat(np.arange(len(pieces)), [len(piece) for piece in pieces])
     ends = np.unique(np.concatenate([last - [len(piece) for piece in pieces], last - 1]))
-    pairs = list(_near_ends(points_of(latitude, longitude).surface, piece_of, ends, join_m))
+    pairs = list(_meeting_points(points_of(latitude, longitude).surface, piece_of, ends, join_m))
     end_row = {(piece.name, 1): int(row) - 1 for piece, row in zip(pieces, last, strict=True)}
     end_row |= {(piece.name, 0): int(row) - len(piece) for piece, row in zip(pieces, last, strict=True)}
     pairs += [
@@ -106,7 +106,7 @@ def _nodes(pieces: list[LinePiece], join_m: float, relations: list[Relation]) ->
     return [np.asarray(part) for part in np.split(joined, last[:-1])]
 
 
-def _near_ends(surface: Floats, piece_of: Ints, ends: Ints, join_m: float) -> Iterator[tuple[int, int]]:
+def _meeting_points(surface: Floats, piece_of: Ints, ends: Ints, join_m: float) -> Iterator[tuple[int, int]]:
     """The nearest vertex of another piece within reach of each end, or an end of its own (a ring)."""
     tree = cKDTree(surface)
     at_end = np.zeros(len(surface), dtype=bool)
@@ -118,7 +118,9 @@ def _near_ends(surface: Floats, piece_of: Ints, ends: Ints, join_m: float) -> It
             yield int(end), others[int(np.argmin(apart_m))]
 
 
-def _without_doubles(pieces: list[LinePiece], nodes: list[Ints], survey: Survey) -> tuple[list[LinePiece], list[Ints]]:
+def _without_repeated_stretches(
+    pieces: list[LinePiece], nodes: list[Ints], survey: Survey
+) -> tuple[list[LinePiece], list[Ints]]:
     """Pieces with each stretch between two nodes once: the first line that has it keeps it."""
     seen: set[tuple[int, int]] = set()
     kept = []
@@ -137,7 +139,7 @@ def _without_doubles(pieces: list[LinePiece], nodes: list[Ints], survey: Survey)
     return kept, kept_nodes
 
 
-def _crossings(
+def _crossing_nodes(
     pieces: list[LinePiece], nodes: list[Ints], switches: set[int], survey: Survey, config: SurveyConfig
 ) -> set[int]:
     """Nodes where tracks cross without a switch: those named so, and those where two lines just run through.
@@ -178,7 +180,7 @@ def _nodes_at(
     return set(np.concatenate(nodes)[row[row < tree.n]].tolist())
 
 
-def _cut(pieces: list[LinePiece], nodes: list[Ints], crossings: set[int]) -> tuple[list[LinePiece], Ints]:
+def _cut_at_nodes(pieces: list[LinePiece], nodes: list[Ints], crossings: set[int]) -> tuple[list[LinePiece], Ints]:
     """Elements from node to node; the parts of a piece are named `id.1`, `id.2` along it."""
     passing = np.bincount(np.concatenate(nodes))
     parts: list[LinePiece] = []
@@ -206,7 +208,7 @@ def arms_of(ends: Ints) -> dict[int, list[tuple[int, int]]]:
     return arms
 
 
-def _links(
+def _link_table(
     table: pl.DataFrame, ends: Ints, crossings: set[int], switches: set[int], survey: Survey, config: SurveyConfig
 ) -> pl.DataFrame:
     """The relations given, as they are; of ends that none of them names every pair at a node, by its angle.
@@ -226,14 +228,14 @@ def _links(
         if len(here) > 1 and not unsaid:
             continue
         units = [directions[arm] / max(float(np.linalg.norm(directions[arm])), 1e-9) for arm in meeting]
-        pairs = _navigable(units, node in crossings, node in switches, config.switch_deg)
+        pairs = _navigable_pairs(units, node in crossings, node in switches, config.switch_deg)
         for pair in unsaid:
             navigability = Navigability.BOTH if pair in pairs else Navigability.NONE
             first, second = (here[k] for k in pair)
             rows.append((*first, *second, navigability.value))
         guessed += [here] * bool(unsaid)
         if node not in crossings | switches:
-            _report_node([name for name, _ in here], pairs, survey)
+            _report_dead_ends([name for name, _ in here], pairs, survey)
     _report_guesses(guessed, len(rows) - len(relations), bool(relations), survey)
     links = Links.validate(pl.DataFrame(rows, schema=list(Links.columns()), orient="row"), cast=True)
     known, findings = relations_to_nowhere(track, links)
@@ -251,7 +253,7 @@ def _report_guesses(nodes: list[list[tuple[str, int]]], pairs: int, some_given: 
     survey.report("warning" if some_given else "note", "links", text, "Look whether trains can run so.")
 
 
-def _navigable(units: list[Floats], crossing: bool, switch: bool, switch_deg: float) -> set[tuple[int, int]]:
+def _navigable_pairs(units: list[Floats], crossing: bool, switch: bool, switch_deg: float) -> set[tuple[int, int]]:
     """Pairs of arms that a train can take; at a crossing each arm goes on straight only.
 
     Two arms that meet two are a crossing, unless the survey names a switch (a slip) there.
@@ -275,7 +277,7 @@ def _navigable(units: list[Floats], crossing: bool, switch: bool, switch_deg: fl
     return straight
 
 
-def _report_node(names: list[str], pairs: set[tuple[int, int]], survey: Survey) -> None:
+def _report_dead_ends(names: list[str], pairs: set[tuple[int, int]], survey: Survey) -> None:
     """Report net elements at a node from which no train gets on."""
     place = f"links: {', '.join(names)}"
     lonely = [name for arm, name in enumerate(names) if len(names) > 1 and not any(arm in pair for pair in pairs)]

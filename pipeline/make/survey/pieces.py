@@ -71,12 +71,12 @@ class LinePiece:
         return points_of(self.latitude_deg, self.longitude_deg).surface
 
     @property
-    def solid(self) -> Floats:
+    def positions_3d(self) -> Floats:
         """The points at their heights, at height zero where one of them has none, earth-centred [m]."""
         height = np.zeros(len(self)) if np.isnan(self.height_m).any() else self.height_m
         return earth_centred_m(self.latitude_deg, self.longitude_deg, height)
 
-    def place(self, row: int) -> str:
+    def place_words(self, row: int) -> str:
         """A point in words."""
         return f"{self.latitude_deg[row]:.6f}, {self.longitude_deg[row]:.6f}"
 

@@ -20,7 +20,7 @@ _MOST_S = 5.0
 _HOLD_S = 30.0
 
 
-def reachable(fixes: Fixes) -> Ints:
+def reachable_rows(fixes: Fixes) -> Ints:
     """Rows with a position to which the train can have come from the last one believed.
 
     Causal: a sample is judged by those before it.
@@ -30,26 +30,27 @@ def reachable(fixes: Fixes) -> Ints:
     t_s = fixes.t_s[rows]
     since = np.searchsorted(t_s, t_s - _LEAST_S, side="right") - 1
 
-    def reached(before: Ints, after: Ints) -> Bools:
+    def is_reachable(before: Ints, after: Ints) -> Bools:
+        """Whether each position `after` can be come to from the one `before`, or is too late to be judged by it."""
         velocity = _velocity_mps(fixes, rows, since[before], before)
         held = t_s[after] - t_s[before] <= _HOLD_S
         return ~held | _within_reach(fixes, rows[before], rows[after], velocity)
 
     number = np.arange(len(rows))
-    doubtful = np.flatnonzero(~reached(number[:-1], number[1:]))
+    doubtful = np.flatnonzero(~is_reachable(number[:-1], number[1:]))
     while len(doubtful):
         # Follow the first doubtful sample until one is believed again; from there the pairs above hold.
         last = int(doubtful[0])
         held = int(np.searchsorted(t_s, t_s[last] + _HOLD_S, side="right"))
         later = number[last + 1 : held + 1]
-        back = np.flatnonzero(reached(np.full(len(later), last), later))
+        back = np.flatnonzero(is_reachable(np.full(len(later), last), later))
         again = int(later[back[0]]) if len(back) else len(rows)
         believed[last + 1 : again] = False
         # Velocities of later samples must not start at one that is not believed.
         near = number[again : int(np.searchsorted(since, again))]
         since[near] = np.minimum(since[near], last)
         pairs = near[near < len(rows) - 1]
-        doubt = pairs[~reached(pairs, pairs + 1)]
+        doubt = pairs[~is_reachable(pairs, pairs + 1)]
         doubtful = np.concatenate([doubt, doubtful[doubtful >= again + len(near)]])
     return rows[believed]
 

@@ -12,7 +12,7 @@ from pipeline.make.receivers.messages import UnknownError
 from pipeline.make.survey.geojson_lines import read_geojson
 from pipeline.make.survey.map_files import MAP_SUFFIXES, read_map
 from pipeline.make.survey.pieces import Survey, content_of_survey, piece_of, with_own_names
-from pipeline.make.survey.reachable import reachable
+from pipeline.make.survey.reachable import reachable_rows
 from pipeline.make.survey.tables import read_points
 from pipeline.make.survey.xml_lines import read_kmz, read_xml
 from pipeline.read.ingest.run import read_run
@@ -37,7 +37,7 @@ def read_surveys(
     """
     survey = Survey()
     for path in paths:
-        survey.add(_read(path, epsg, vehicle, config, id_field))
+        survey.add(_read_survey(path, epsg, vehicle, config, id_field))
     if not any(len(piece) > 1 for piece in survey.pieces):
         raise SiteError("holds no line", place=", ".join(map(str, paths)), expected="a line of two points or more")
     if 0 < sum(piece.whole for piece in survey.pieces) < len(survey.pieces):
@@ -51,7 +51,7 @@ def read_surveys(
     return survey
 
 
-def _read(path: Path, epsg: int | None, vehicle: Vehicle, config: Configuration, id_field: str | None) -> Survey:
+def _read_survey(path: Path, epsg: int | None, vehicle: Vehicle, config: Configuration, id_field: str | None) -> Survey:
     """A survey of whatever form."""
     suffix = path.suffix.lower()
     if path.is_dir() or suffix == ".mcap":
@@ -69,10 +69,10 @@ def _read(path: Path, epsg: int | None, vehicle: Vehicle, config: Configuration,
             return read_points(place, path.stem, data, epsg, config.site)
         case _ if suffix in MAP_SUFFIXES:
             return read_map(path, data, config.survey, id_field)
-    return _of_receiver(path, vehicle, config)
+    return _survey_of_receiver(path, vehicle, config)
 
 
-def _of_receiver(path: Path, vehicle: Vehicle, config: Configuration) -> Survey:
+def _survey_of_receiver(path: Path, vehicle: Vehicle, config: Configuration) -> Survey:
     """The line of a drive as a receiver recorded it."""
     try:
         run = as_run(gather([path], config.ingest), path.stem, correct=config.ingest.correct).run
@@ -81,7 +81,7 @@ def _of_receiver(path: Path, vehicle: Vehicle, config: Configuration) -> Survey:
         raise SiteError(
             "is no survey that is known", place=str(path), found=found, expected=_KINDS, remedy=_RECORDED
         ) from None
-    return _of_run(run, path, vehicle, config)
+    return _survey_of_run(run, path, vehicle, config)
 
 
 def read_recorded(path: Path, vehicle: Vehicle, config: Configuration) -> Survey:
@@ -89,10 +89,10 @@ def read_recorded(path: Path, vehicle: Vehicle, config: Configuration) -> Survey
 
     Raises `InputError` where the run cannot be read, `SiteError` where it has no position better than GNSS alone.
     """
-    return _of_run(read_run(str(path), config.ingest, with_digest=False), path, vehicle, config)
+    return _survey_of_run(read_run(str(path), config.ingest, with_digest=False), path, vehicle, config)
 
 
-def _of_run(run: RunLog, path: Path, vehicle: Vehicle, config: Configuration) -> Survey:
+def _survey_of_run(run: RunLog, path: Path, vehicle: Vehicle, config: Configuration) -> Survey:
     """A survey from the positions of a recorded run."""
     points = run.reference
     if points is None:
@@ -106,7 +106,7 @@ def _of_run(run: RunLog, path: Path, vehicle: Vehicle, config: Configuration) ->
         raise SiteError("has no position better than GNSS alone", place=str(path), expected=expected)
     survey = Survey()
     fixes = fixes_of(_as_fixes(points, config.hazards.reference_sigma_m), config.fix_sigma)
-    reached = reachable(fixes)
+    reached = reachable_rows(fixes)
     if (jumped := points.height - len(reached)) > 0:
         text = f"{jumped} positions to which no train can have come are left out"
         survey.report("warning", f"track: {run.run_id}", text, "Look at the recording there.")

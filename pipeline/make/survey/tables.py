@@ -48,15 +48,15 @@ def placed_table(place: str, data: bytes, epsg: int | None, config: SiteConfig) 
     raw = load_table(place, data, breaches)
     if raw is None:
         raise SiteError(breaches[0])
-    table = _renamed(place, raw.frame)
+    table = _with_contract_names(place, raw.frame)
     known = (*NUMBERS, "x_m", "y_m", "line_m", "measure_m", "location_accuracy_m")
-    table = table.with_columns(_numbers(place, table[name]) for name in known if name in table.columns)
+    table = table.with_columns(_parse_numbers(place, table[name]) for name in known if name in table.columns)
     if "line_m" in table.columns and "line_km" not in table.columns:
         table = table.with_columns(line_km=pl.col("line_m") / 1000)
-    return _in_degrees(place, table, raw.epsg if raw.epsg != EPSG_WGS84 else epsg, config)
+    return _table_in_degrees(place, table, raw.epsg if raw.epsg != EPSG_WGS84 else epsg, config)
 
 
-def _in_degrees(place: str, table: pl.DataFrame, epsg: int | None, config: SiteConfig) -> pl.DataFrame:
+def _table_in_degrees(place: str, table: pl.DataFrame, epsg: int | None, config: SiteConfig) -> pl.DataFrame:
     """A table with coordinates in degrees, of whatever reference system."""
     if not {"x_m", "y_m"} <= set(table.columns) or "latitude_deg" in table.columns:
         return table
@@ -76,7 +76,7 @@ def _in_degrees(place: str, table: pl.DataFrame, epsg: int | None, config: SiteC
     return turned
 
 
-def _renamed(place: str, frame: pl.DataFrame) -> pl.DataFrame:
+def _with_contract_names(place: str, frame: pl.DataFrame) -> pl.DataFrame:
     """A table with the names that surveys have here."""
     words = {name: word_of(name) for name in frame.columns}
     fitting = {name: [key for key, pattern in SURVEY.items() if re.fullmatch(pattern, words[name])] for name in words}
@@ -88,7 +88,7 @@ def _renamed(place: str, frame: pl.DataFrame) -> pl.DataFrame:
     return frame.rename(meanings)
 
 
-def _of_stations(text: pl.Series) -> pl.Series:
+def _stations_to_km(text: pl.Series) -> pl.Series:
     """Kilometres and metres, `48+050` and `-0+120`, as kilometres."""
     table = text.str.strip_chars().str.extract_groups(_STATION).struct.unnest()
     sign, km, m = (table[name] for name in ("sign", "km", "m"))
@@ -98,7 +98,7 @@ def _of_stations(text: pl.Series) -> pl.Series:
     return value.cast(pl.String).fill_null(text).alias(text.name)
 
 
-def _numbers(place: str, column: pl.Series) -> pl.Series:
+def _parse_numbers(place: str, column: pl.Series) -> pl.Series:
     """Numbers, with a decimal comma where no number of the column has a point."""
     if column.dtype != pl.String:
         return column.cast(pl.Float64)
@@ -106,7 +106,7 @@ def _numbers(place: str, column: pl.Series) -> pl.Series:
     if not text.str.contains(".", literal=True).any():
         text = text.str.replace(",", ".", literal=True)
     if column.name == "line_km":
-        text = _of_stations(text)
+        text = _stations_to_km(text)
     values = text.cast(pl.Float64, strict=False)
     wrong = (values.is_null() & text.is_not_null()) | ~values.fill_null(0.0).is_finite()
     if wrong.any():

@@ -26,28 +26,30 @@ def clean_traces(survey: Survey, config: SurveyConfig) -> Survey:
     cleaned = replace(survey, pieces=list(surveyed))
     for piece in survey.pieces:
         if piece.recorded and len(piece) > 1:
-            moving = piece.take(_moving(piece, config))
-            for number, part in enumerate(_gapless(moving, cleaned, config), start=1):
+            moving = piece.take(_moving_rows(piece, config))
+            for number, part in enumerate(_split_at_gaps(moving, cleaned, config), start=1):
                 name = f"{piece.name}/{number}" if number > 1 else piece.name
                 cleaned.pieces += _new_track(part, name, cleaned, config)
-    cleaned.pieces = [*_all_thinned(cleaned.pieces, len(surveyed), config.shape_m), *short]
+    cleaned.pieces = [*_thin_all(cleaned.pieces, len(surveyed), config.shape_m), *short]
     return cleaned
 
 
-def _all_thinned(pieces: list[LinePiece], surveyed: int, shape_m: float) -> list[LinePiece]:
+def _thin_all(pieces: list[LinePiece], surveyed: int, shape_m: float) -> list[LinePiece]:
     """All but the first `given` thinned; where a branch leaves another piece, both keep the point."""
-    counts = Counter(place for piece in pieces for place in _places(piece))
-    shared = [np.array([counts[place] > 1 for place in _places(piece)], dtype=np.bool_) for piece in pieces]
-    thinned = [_thinned(piece, held, shape_m) for piece, held in zip(pieces[surveyed:], shared[surveyed:], strict=True)]
+    counts = Counter(place for piece in pieces for place in _coordinates(piece))
+    shared = [np.array([counts[place] > 1 for place in _coordinates(piece)], dtype=np.bool_) for piece in pieces]
+    thinned = [
+        _thin_piece(piece, held, shape_m) for piece, held in zip(pieces[surveyed:], shared[surveyed:], strict=True)
+    ]
     return [*pieces[:surveyed], *thinned]
 
 
-def _places(piece: LinePiece) -> list[tuple[float, float]]:
+def _coordinates(piece: LinePiece) -> list[tuple[float, float]]:
     """Latitude and longitude of each point."""
     return list(zip(piece.latitude_deg.tolist(), piece.longitude_deg.tolist(), strict=True))
 
 
-def _moving(piece: LinePiece, config: SurveyConfig) -> Ints:
+def _moving_rows(piece: LinePiece, config: SurveyConfig) -> Ints:
     """Rows that are a step away from the one kept before."""
     places = piece.surface
     sigma_m = piece.sigma_m[np.isfinite(piece.sigma_m)]
@@ -59,13 +61,13 @@ def _moving(piece: LinePiece, config: SurveyConfig) -> Ints:
     return np.array(kept, dtype=np.int64)
 
 
-def _gapless(piece: LinePiece, survey: Survey, config: SurveyConfig) -> Iterator[LinePiece]:
+def _split_at_gaps(piece: LinePiece, survey: Survey, config: SurveyConfig) -> Iterator[LinePiece]:
     """Parts of a recorded line between gaps."""
     steps = np.linalg.norm(np.diff(piece.surface, axis=0), axis=1)
     usual_m = float(np.median(steps)) if len(steps) else 0.0
     gaps = np.flatnonzero(steps > max(config.gap_m, config.gap_steps * usual_m))
     for gap in gaps:
-        text = f"nothing was recorded for {steps[gap]:.0f} m from {piece.place(int(gap))}"
+        text = f"nothing was recorded for {steps[gap]:.0f} m from {piece.place_words(int(gap))}"
         survey.report("warning", f"track: {piece.name}", text, "Survey the missing piece.")
     for rows in np.split(np.arange(len(piece)), gaps + 1):
         yield piece.take(rows)
@@ -76,7 +78,7 @@ def _new_track(piece: LinePiece, name: str, survey: Survey, config: SurveyConfig
     parts: list[LinePiece] = []
     known = list(survey.pieces)
     for single_pass in _split_at_repeats(piece, config):
-        covered = _covered(single_pass.surface, known, config.same_track_m)
+        covered = _are_covered(single_pass.surface, known, config.same_track_m)
         distance_m = distance_along_m(single_pass.surface)
         for first, last in spans_of(~covered):
             if distance_m[last] - distance_m[first] >= config.toe_m:
@@ -108,11 +110,11 @@ def _split_at_repeats(piece: LinePiece, config: SurveyConfig) -> Iterator[LinePi
         yield piece.take(np.arange(low, int(part[-1]) + 1))
 
 
-def _covered(places: Floats, known: list[LinePiece], same_track_m: float) -> np.ndarray:
+def _are_covered(places: Floats, known: list[LinePiece], same_track_m: float) -> np.ndarray:
     """Which places lie on track that is known."""
     if not known:
         return np.zeros(len(places), dtype=bool)
-    tree = cKDTree(np.concatenate([_dense(piece.surface) for piece in known]))
+    tree = cKDTree(np.concatenate([_densify(piece.surface) for piece in known]))
     return np.asarray(tree.query(places)[0] <= same_track_m)
 
 
@@ -156,8 +158,8 @@ def _switch_toe(
     return best[1]
 
 
-def _dense(places: Floats) -> Floats:
-    """Points at most a metre apart along a line."""
+def _densify(places: Floats) -> Floats:
+    """Points at most a metre apart along a line, earth-centred [m]."""
     if len(places) < 2:
         return places
     distance_m = distance_along_m(places)
@@ -165,9 +167,9 @@ def _dense(places: Floats) -> Floats:
     return np.column_stack([np.interp(at, distance_m, places[:, axis]) for axis in range(3)])
 
 
-def _thinned(piece: LinePiece, held: Bools, shape_m: float) -> LinePiece:
+def _thin_piece(piece: LinePiece, held: Bools, shape_m: float) -> LinePiece:
     """Without points whose leaving out moves the line by less than `shape_m`; those held stay."""
-    places = piece.solid
+    places = piece.positions_3d
     kept = held.copy()
     kept[[*range(0, len(places), _BLOCK), len(places) - 1]] = True
     spans = [tuple(pair) for pair in zip(np.flatnonzero(kept)[:-1], np.flatnonzero(kept)[1:], strict=True)]

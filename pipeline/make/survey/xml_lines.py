@@ -74,7 +74,7 @@ class _XmlLines:
         self.parser.StartDoctypeDeclHandler = self._refuse
 
     def _refuse(self, *_: object) -> None:
-        """Refuse a document type."""
+        """Refuse a document type: it may define entities without end."""
         raise SiteError(
             "declares a document type, which no GPX and no KML needs",
             place=f"{self.place}: line {self.parser.CurrentLineNumber}",

@@ -79,7 +79,10 @@ def compare_hazards(
     changes += [_change("appeared", b, row) for row in range(b.height) if row not in pairs.values()]
     ids = ["hazard_id", "caused_by"] if changes else []
     for row_a, row_b in pairs.items():
-        rows = (a.drop(ids, strict=False)[row_a : row_a + 1], b.drop(ids, strict=False)[row_b : row_b + 1])
+        rows = (
+            a.drop(ids, strict=False)[row_a : row_a + 1],
+            b.drop(ids, strict=False)[row_b : row_b + 1],
+        )
         differing = tuple(item for item in compare_tables(*rows, Hazards, rules=rules) if item.kind == "values")
         if differing:
             changes.append(_change("changed", a, row_a, differing))

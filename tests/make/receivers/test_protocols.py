@@ -7,7 +7,7 @@ import pytest
 
 from datasets.trial import write_run_as
 from pipeline.make.receivers import convert
-from pipeline.make.receivers.frames import Protocol, frames
+from pipeline.make.receivers.frames import Protocol, whole_messages
 from pipeline.read.ingest import read_run
 from schemas.config import IngestConfig
 from schemas.errors import InputError
@@ -107,12 +107,12 @@ def test_a_damaged_length_hides_nothing_of_what_follows(converted):
 def test_every_protocol_is_framed_and_damage_is_counted_once():
     block = pvt_geodetic(0)
     whole = [nav_pvt(1000), block, gga("120000.00")]
-    assert list(frames(b"".join(whole), pytest.fail)) == list(
+    assert list(whole_messages(b"".join(whole), pytest.fail)) == list(
         zip((Protocol.UBX, Protocol.SBF, Protocol.NMEA), whole, strict=True)
     )
     broken = []
     spoiled = [part[:20] + bytes([part[20] ^ 1]) + part[21:] for part in whole] + [whole[0][:-1]]
-    assert list(frames(b"".join(spoiled), lambda: broken.append(1))) == []
+    assert list(whole_messages(b"".join(spoiled), lambda: broken.append(1))) == []
     assert len(broken) == 4
 
 

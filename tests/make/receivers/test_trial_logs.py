@@ -13,7 +13,7 @@ import numpy as np
 import polars as pl
 import pytest
 
-from pipeline.make.receivers import Purpose, as_run, convert, extended, gather
+from pipeline.make.receivers import Purpose, as_run, convert, extend_run, gather
 from schemas.config import FixSigma
 from schemas.errors import InputError, UsageError
 from tests.make.receivers.test_convert import SAMPLES, needs_samples
@@ -165,31 +165,31 @@ def test_several_receivers_make_one_run(tmp_path):
     run = as_run(gather([log]), "r").run
     rover = gather([solution(tmp_path, "rover.pos")])
     with pytest.raises(UsageError, match=r"has the solution primary already.*--solution"):
-        extended(run, HERE, rover, Purpose(), FixSigma(), force=False)
-    both = extended(run, HERE, rover, Purpose("second"), FixSigma(), force=False).run
+        extend_run(run, HERE, rover, Purpose(), FixSigma(), force=False)
+    both = extend_run(run, HERE, rover, Purpose("second"), FixSigma(), force=False).run
     assert dict(both.gnss.group_by("solution").len().iter_rows()) == {"primary": 2, "second": 3}
-    replaced = extended(both, HERE, rover, Purpose(), FixSigma(), force=True).run
+    replaced = extend_run(both, HERE, rover, Purpose(), FixSigma(), force=True).run
     assert dict(replaced.gnss.group_by("solution").len().iter_rows()) == {"primary": 3, "second": 3}
-    truth = extended(run, HERE, rover, Purpose(stream="reference"), FixSigma(), force=False).run
+    truth = extend_run(run, HERE, rover, Purpose(stream="reference"), FixSigma(), force=False).run
     assert truth.gnss.equals(run.gnss)
     assert truth.reference is not None
     told = rover.streams["gnss"].row(0, named=True)
     ellipse = [[told["cov_ee_m2"], told["cov_en_m2"]], [told["cov_en_m2"], told["cov_nn_m2"]]]
     assert truth.reference["sigma_m"].to_list() == pytest.approx([np.linalg.eigvalsh(ellipse)[1] ** 0.5] * 3)
     with pytest.raises(UsageError, match=r"--solution: is empty"):
-        extended(run, HERE, rover, Purpose(" "), FixSigma(), force=False)
+        extend_run(run, HERE, rover, Purpose(" "), FixSigma(), force=False)
     with pytest.raises(UsageError, match=r"has a stream reference already.*--force"):
-        extended(truth, HERE, rover, Purpose(stream="reference"), FixSigma(), force=False)
+        extend_run(truth, HERE, rover, Purpose(stream="reference"), FixSigma(), force=False)
     with pytest.raises(InputError, match="is of another time"):
-        extended(run, HERE, gather([solution(tmp_path, "b.pos", 5)]), Purpose("x"), FixSigma(), force=False)
+        extend_run(run, HERE, gather([solution(tmp_path, "b.pos", 5)]), Purpose("x"), FixSigma(), force=False)
 
 
 def test_a_reference_without_stated_accuracy_is_not_exact(tmp_path):
     log = tmp_path / "a.gps"
     log.write_bytes(bestposa())
     fixes = gather([log]).streams["gnss"].with_columns(pl.lit(None, pl.Float64).alias("cov_ee_m2"))
-    found = as_run(gather([log]), "r").gathered()
+    found = as_run(gather([log]), "r").as_gatherings()
     found.streams["gnss"] = fixes
-    run = extended(as_run(gather([log]), "r").run, HERE, found, Purpose(stream="reference"), FixSigma(), False).run
+    run = extend_run(as_run(gather([log]), "r").run, HERE, found, Purpose(stream="reference"), FixSigma(), False).run
     assert run.reference is not None
     assert run.reference["sigma_m"].to_list() == [FixSigma().rtk_fixed_m]

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from pipeline.make.survey.reachable import reachable
+from pipeline.make.survey.reachable import reachable_rows
 from pipeline.stages.matching.epochs import fixes_of
 from schemas.arrays import Floats
 from schemas.config import FixSigma
@@ -14,7 +14,7 @@ from tests.stages.matching.builders import run
 
 def left_out(x_m: Floats, rate_hz: float) -> list[int]:
     fixes = fixes_of(run(x_m, np.zeros(len(x_m)), rate_hz, sigma_m=0.1), FixSigma())
-    return np.setdiff1d(np.arange(len(x_m)), reachable(fixes)).tolist()
+    return np.setdiff1d(np.arange(len(x_m)), reachable_rows(fixes)).tolist()
 
 
 @pytest.mark.parametrize("jump_m", [-100.0, -60.0, -30.0, 30.0, 60.0, 100.0])

@@ -12,7 +12,7 @@ import numpy as np
 import polars as pl
 import pytest
 
-from pipeline.make.survey.make import make_site, wish_of, write_made
+from pipeline.make.survey.make import make_site, site_request, write_site
 from pipeline.make.survey.network import make_network
 from pipeline.make.survey.pieces import LinePiece, Survey
 from pipeline.make.survey.trace import clean_traces
@@ -57,7 +57,9 @@ def written(folder: Path, name: str, *features: dict[str, Any]) -> Path:
 
 def site_of(*surveys: Path, balises: str | None = None, **wishes: Any) -> Site:
     travel = wishes.get("travel", TravelAlong.BOTH)
-    wish = wish_of(list(surveys), balises, wishes.get("epsg"), wishes.get("join_m"), wishes.get("flat", False), travel)
+    wish = site_request(
+        list(surveys), balises, wishes.get("epsg"), wishes.get("join_m"), wishes.get("flat", False), travel
+    )
     return make_site(wish, Vehicle(), Configuration(survey=SurveyConfig(**wishes.get("config", {}))))
 
 
@@ -271,7 +273,7 @@ def test_gpx_kml_and_kmz_give_the_same_line_and_the_same_ids_each_time(tmp_path:
     assert sites[0].track["netelement_id"].unique().to_list() == ["Line 36"]
     assert sites[0].track["height_m"].to_list() == [100.0, 101.0, 102.0]
     for name in ("one", "two"):
-        write_made(sites[0], site_page(name, sites[0]), tmp_path / name, force=False)
+        write_site(sites[0], site_page(name, sites[0]), tmp_path / name, force=False)
     files = ("track.parquet", "links.parquet", "balises.parquet")
     assert all((tmp_path / "one" / name).read_bytes() == (tmp_path / "two" / name).read_bytes() for name in files)
     assert not any(without_checksums((tmp_path / "one" / name).read_bytes()) for name in files)
@@ -285,7 +287,7 @@ def test_gpx_kml_and_kmz_give_the_same_line_and_the_same_ids_each_time(tmp_path:
         "https://www.openstreetmap.org/?", ""
     )  # a link, opened by a click
     with pytest.raises(BaliseError, match="holds a site"):
-        write_made(sites[0], "", tmp_path / "one", force=False)
+        write_site(sites[0], "", tmp_path / "one", force=False)
 
 
 def recorded(name: str, east_m: np.ndarray, north_m: np.ndarray, rng: np.random.Generator) -> LinePiece:

@@ -11,7 +11,7 @@ import pytest
 
 from datasets.mcap_log import write_mcap
 from pipeline.make.receivers import convert
-from pipeline.make.receivers.convert import said_of
+from pipeline.make.receivers.convert import words_for_dropped
 from pipeline.read.ingest import read_run
 from pipeline.read.ingest.conform import conform
 from pipeline.read.ingest.csv_draft import draft_mapping
@@ -125,7 +125,7 @@ def test_of_a_table(tmp_path: Path) -> None:
     assert found.run.odometer["distance_m"].to_numpy() == pytest.approx(true * 0.05)
     (reason,) = [reason for reason in found.dropped if "wrap" in reason]
     assert "`wrap = 65536` in its mapping" in reason
-    assert said_of(reason) == "noted"
+    assert words_for_dropped(reason) == "noted"
     declared = convert(logs, "r", mapped(wrap=65536.0))
     assert declared.run.odometer is not None
     assert declared.run.odometer.equals(found.run.odometer)

@@ -276,7 +276,7 @@ def test_a_path_survives_the_way_between_processes() -> None:
     other = pickle.loads(pickle.dumps(path))
     place = (np.array([50.0005]), np.array([14.01]))
     assert on_first_leg(other, *place)[0][0] == on_first_leg(path, *place)[0][0]
-    assert other.elements() == ["a", "b"]
+    assert other.element_names() == ["a", "b"]
 
 
 def test_unknown_places_are_nan_and_none() -> None:
