@@ -258,7 +258,7 @@ def test_an_interrupted_conversion_goes_on(project: Path, monkeypatch: pytest.Mo
             os.kill(os.getpid(), signal.SIGINT)
         return convert_entry(opened, entry, *others)
 
-    monkeypatch.setattr("pipeline.project.run.run_of_logs", interrupted)
+    monkeypatch.setattr("pipeline.project.run.convert_entry", interrupted)
     assert call("run", "-q") == 128 + signal.SIGINT
     assert not (project / "made/two/gnss.parquet").exists()
     assert not (project / "result").exists()
