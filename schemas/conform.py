@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Mapping, Sequence
 from functools import lru_cache
+from operator import is_
 
 import dataframely as dy
 import polars as pl
@@ -59,10 +60,11 @@ def shaped(frame: pl.DataFrame, schema: type[dy.Schema]) -> pl.DataFrame:
     Returns:
         The table.
     """
-    series = {column.name: column for column in frame.get_columns()}
-    if (list(series), [column.dtype for column in series.values()]) == _names_and_dtypes(schema):
-        return frame
-    return pl.DataFrame([_cast(series[rule.name], rule.dtype) for rule in _rules(schema)])
+    recorded = frame.get_columns()
+    series = {column.name: column for column in recorded}
+    columns = [_cast(series[rule.name], rule.dtype) for rule in _rules(schema)]
+    same = len(columns) == len(recorded) and all(map(is_, columns, recorded))
+    return frame if same else pl.DataFrame(columns)
 
 
 def table_of_rows(rows: Sequence[Mapping[str, object]], dtypes: Mapping[str, pl.DataType]) -> pl.DataFrame:
@@ -104,12 +106,6 @@ def meanings(schema: type[dy.Schema]) -> dict[str, dict[str, str]]:
 def _cast(series: pl.Series, dtype: pl.DataType) -> pl.Series:
     """A series in a type."""
     return series if series.dtype == dtype else series.cast(dtype)
-
-
-@lru_cache(maxsize=64)
-def _names_and_dtypes(schema: type[dy.Schema]) -> tuple[list[str], list[pl.DataType]]:
-    """Names and types of the columns of a schema."""
-    return [rule.name for rule in _rules(schema)], [rule.dtype for rule in _rules(schema)]
 
 
 @lru_cache(maxsize=64)
