@@ -48,14 +48,7 @@ from pipeline.stages.judge.failures import (
     within_budget,
 )
 from pipeline.stages.judge.hazards import HazardRow, _evidence, crossed_by, hazard_rows, instants, rate_mps, size_m
-from pipeline.stages.judge.judge import (
-    TrueCrossing,
-    _true_times,
-    _within_gap,
-    between_far_epochs,
-    failures_of,
-    true_crossings,
-)
+from pipeline.stages.judge.judge import _true_times, _within_gap, failures_of
 from pipeline.stages.judge.judged import RIGHT, UNKNOWN, WRONG, Judgements
 from pipeline.stages.judge.judgement import (
     JudgeInput,
@@ -65,6 +58,7 @@ from pipeline.stages.judge.judgement import (
     margins_m,
     with_own_anchors,
 )
+from pipeline.stages.judge.train_crossings import TrueCrossing, between_far_epochs, true_crossings
 from pipeline.stages.track.path import Place, RoutePath
 from schemas.config import Configuration, HazardConfig, LdsConfig, Vehicle
 from schemas.enums import Evidence, Hazard, Judgement, LdsState, PassageStatus, Suspect, Verdict
