@@ -67,19 +67,23 @@ def shaped(frame: pl.DataFrame, schema: type[dy.Schema]) -> pl.DataFrame:
     return frame if same else pl.DataFrame(columns)
 
 
-def table_of_rows(rows: Sequence[Mapping[str, object]], dtypes: Mapping[str, pl.DataType]) -> pl.DataFrame:
-    """Rows by the names of these columns as a table; most runs have no hazard and no alarm, and columns are many.
+def table_of_rows(rows: Sequence[Mapping[str, object]], schema: type[dy.Schema]) -> pl.DataFrame:
+    """Rows as a table of a contract; most runs have no hazard and no alarm, and columns are many.
 
     Args:
-        rows: values by column name, one mapping per row.
-        dtypes: the columns in order.
+        rows: values by column name, one mapping per row; columns that are not named are null.
+        schema: the contract.
 
     Returns:
         The table.
     """
-    if not rows:
-        return pl.DataFrame([pl.Series(name, dtype=dtype) for name, dtype in dtypes.items()])
-    return pl.DataFrame(rows, schema=dtypes)
+    return pl.DataFrame(rows, schema=dtypes(schema)) if rows else _empty(schema).clone()
+
+
+@lru_cache(maxsize=64)
+def _empty(schema: type[dy.Schema]) -> pl.DataFrame:
+    """A table of the contract without rows."""
+    return pl.DataFrame([pl.Series(name, dtype=dtype) for name, dtype in dtypes(schema).items()])
 
 
 def dtypes(schema: type[dy.Schema]) -> dict[str, pl.DataType]:

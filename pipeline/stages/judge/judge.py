@@ -68,7 +68,7 @@ def passages_table(
     t_true = passages["t_true"]
     virtual = _are(passages["kind"], BaliseKind.VIRTUAL)
     accepted = virtual & _are(passages["status"], PassageStatus.ACCEPTED)
-    offered_ns = ints(passages["t_offered"].dt.timestamp("ns"))
+    offered_ns = ints(passages["t_offered"].cast(pl.Int64))
     positioned = _within_gap(stamps, ints(t_true), given.config.lds) & t_true.is_not_null().to_numpy()
     of_offers, inserted = _of_offers(passages, offers, rows)
     frame = passages.with_columns(
@@ -113,7 +113,7 @@ def _of_offers(
 
 def _known(numbers: Ints) -> pl.Series:
     """Numbers as a column, null for `NOTHING`."""
-    return pl.Series(numbers, dtype=pl.Int64).replace(NOTHING, None)
+    return pl.Series(numbers).set(pl.Series(numbers == NOTHING), None)
 
 
 def _true_times(passages: pl.DataFrame, crossings: Crossings) -> pl.Series:
@@ -121,7 +121,7 @@ def _true_times(passages: pl.DataFrame, crossings: Crossings) -> pl.Series:
 
     A passage with neither takes what is left, in order.
     """
-    about = passages.select(pl.coalesce("t_offered", "t_reckoned")).to_series().dt.timestamp("ns").to_list()
+    about = passages.select(pl.coalesce("t_offered", "t_reckoned")).to_series().cast(pl.Int64).to_list()
     balises = passages["balise_id"].to_list()
     pairs = sorted(
         (abs(crossing.t_ns - t_ns), row, crossing)
@@ -151,7 +151,7 @@ def _within_gap(stamps: Ints, t_ns: Ints, lds: LdsConfig) -> Bools:
 
 def _speeds(passages: pl.DataFrame, t_true: pl.Series, epochs: AlignedEpochs, lds: LdsConfig) -> pl.Series:
     """Speed of the train at the offer, else where it passed [m/s]; null in a gap of the epochs."""
-    at = passages["t_offered"].dt.timestamp("ns").fill_null(t_true)
+    at = passages["t_offered"].cast(pl.Int64).fill_null(t_true)
     stamps = epochs.t_ns[np.isfinite(epochs.speed_mps)]
     known = at.is_not_null().to_numpy() & _within_gap(stamps, ints(at), lds)
     return pl.Series("speed_mps", np.where(known, speed_at(epochs, ints(at)), np.nan), nan_to_null=True)
