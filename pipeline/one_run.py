@@ -65,8 +65,12 @@ def replay(run: RunLog, site: Site, vehicle: Vehicle | None = None, config: Conf
             parts.append(_failed(prepared, solution, error))
     if len(errors) == len(parts):
         raise errors[0]
-    whole = {name: pl.concat([part[name] for part in parts]) if len(parts) > 1 else parts[0][name] for name in TABLES}
-    return RunTables(run_id=run.run_id, **whole)
+    return RunTables(run_id=run.run_id, **(parts[0] if len(parts) == 1 else _below_one_another(parts)))
+
+
+def _below_one_another(parts: Sequence[Tables]) -> Tables:
+    """The tables of several solutions as one each."""
+    return {name: pl.concat([shaped(part[name], schema) for part in parts]) for name, schema in TABLES.items()}
 
 
 def monitor_alone(run: RunLog, site: Site, vehicle: Vehicle, config: Configuration, solution: str) -> MonitoredSolution:
@@ -126,15 +130,13 @@ def _of_solution(prepared: PreparedRun, solution: str, channel: Channel, evidenc
     suspect = pl.Series("suspect_after_the_fact", judged.suspect_after_the_fact)
     of_fixes = monitored.solution.fixes["satellites"]
     columns = (suspect, *results.lost.columns(), of_fixes, *unnoticed.epochs)
-    tables = {
+    return {
         "hazards": judged.hazards,
         "passages": judged.passages,
         "alarms": judged.alarms,
         "epochs": pl.DataFrame([*judged.epochs.contract_series(), *columns]),
         "runs": summarise(results, prepared.config, prepared.provenance),
     }
-    # Judged epochs have more columns than the contract: those end here.
-    return {name: shaped(table, TABLES[name]) for name, table in tables.items()}
 
 
 def _case(

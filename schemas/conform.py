@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Mapping, Sequence
 from functools import lru_cache
+from operator import is_
 
 import dataframely as dy
 import polars as pl
@@ -59,25 +60,30 @@ def shaped(frame: pl.DataFrame, schema: type[dy.Schema]) -> pl.DataFrame:
     Returns:
         The table.
     """
-    series = {column.name: column for column in frame.get_columns()}
-    if (list(series), [column.dtype for column in series.values()]) == _names_and_dtypes(schema):
-        return frame
-    return pl.DataFrame([_cast(series[rule.name], rule.dtype) for rule in _rules(schema)])
+    recorded = frame.get_columns()
+    series = {column.name: column for column in recorded}
+    columns = [_cast(series[rule.name], rule.dtype) for rule in _rules(schema)]
+    same = len(columns) == len(recorded) and all(map(is_, columns, recorded))
+    return frame if same else pl.DataFrame(columns)
 
 
-def table_of_rows(rows: Sequence[Mapping[str, object]], dtypes: Mapping[str, pl.DataType]) -> pl.DataFrame:
-    """Rows by the names of these columns as a table; most runs have no hazard and no alarm, and columns are many.
+def table_of_rows(rows: Sequence[Mapping[str, object]], schema: type[dy.Schema]) -> pl.DataFrame:
+    """Rows as a table of a contract; most runs have no hazard and no alarm, and columns are many.
 
     Args:
-        rows: values by column name, one mapping per row.
-        dtypes: the columns in order.
+        rows: values by column name, one mapping per row; columns that are not named are null.
+        schema: the contract.
 
     Returns:
         The table.
     """
-    if not rows:
-        return pl.DataFrame([pl.Series(name, dtype=dtype) for name, dtype in dtypes.items()])
-    return pl.DataFrame(rows, schema=dtypes)
+    return pl.DataFrame(rows, schema=dtypes(schema)) if rows else _empty(schema).clone()
+
+
+@lru_cache(maxsize=64)
+def _empty(schema: type[dy.Schema]) -> pl.DataFrame:
+    """A table of the contract without rows."""
+    return pl.DataFrame([pl.Series(name, dtype=dtype) for name, dtype in dtypes(schema).items()])
 
 
 def dtypes(schema: type[dy.Schema]) -> dict[str, pl.DataType]:
@@ -104,12 +110,6 @@ def meanings(schema: type[dy.Schema]) -> dict[str, dict[str, str]]:
 def _cast(series: pl.Series, dtype: pl.DataType) -> pl.Series:
     """A series in a type."""
     return series if series.dtype == dtype else series.cast(dtype)
-
-
-@lru_cache(maxsize=64)
-def _names_and_dtypes(schema: type[dy.Schema]) -> tuple[list[str], list[pl.DataType]]:
-    """Names and types of the columns of a schema."""
-    return [rule.name for rule in _rules(schema)], [rule.dtype for rule in _rules(schema)]
 
 
 @lru_cache(maxsize=64)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import errno
 import traceback
+from collections.abc import Mapping, Sequence
 from concurrent.futures import Future
 from typing import Any
 
@@ -15,7 +16,7 @@ from pipeline.results.figures.head import HAZARD_COUNTS, known_counts, worst_ver
 from pipeline.results.outcome import VERDICT_FIGURES, RunOutcome
 from pipeline.stages.prepare import Provenance
 from pipeline.storage.address import Address, redacted
-from schemas.enums import RunStatus, RunVerdict
+from schemas.enums import RunStatus
 from schemas.errors import BaliseError, InputError
 from schemas.frozen import frozen
 from schemas.run import RunTables
@@ -111,6 +112,8 @@ def outcome_of(
     judged = known_counts(counted).drop_nulls("missed_detections")
     *counts, missed = judged.select(pl.sum(*HAZARD_COUNTS, "missed_detections")).row(0)
     verdict = worst_verdict(runs["verdict"].to_list())
+    # The solutions that have the verdict of the run.
+    rows = [row for row in runs.iter_rows(named=True) if verdict is not None and row["verdict"] == verdict.value]
     return RunOutcome(
         run_id=run_id,
         status=worst(runs),
@@ -118,18 +121,15 @@ def outcome_of(
         verdict=verdict,
         hazards=sum(counts) if judged.height else None,
         missed_detections=missed if judged.height else None,
-        why=_why(runs, verdict),
+        why=_why(rows, several=runs.height > 1),
         faults=tuple(hazard_words(hazards, passages)),
         log=redacted(log),
-        **_figures_of_verdict(runs, verdict, low),
+        **(_figures_of_verdict(rows[0], low) if rows else {}),
     )
 
 
-def _figures_of_verdict(runs: pl.DataFrame, verdict: RunVerdict | None, low: float) -> dict[str, Any]:
-    """Figures next to the verdict, of the solution that heads the run; nothing where all failed."""
-    if verdict is None:
-        return {}
-    row = runs.filter(pl.col("verdict").cast(pl.String) == verdict.value).row(0, named=True)
+def _figures_of_verdict(row: Mapping[str, Any], low: float) -> dict[str, Any]:
+    """Figures next to the verdict, of the solution that heads the run."""
     figures = {name: row[name] for name in VERDICT_FIGURES}
     figures |= {name: tuple(row[name] or ()) for name in ("remedies", "remedies_gain")}
     available = row["availability"]
@@ -138,15 +138,9 @@ def _figures_of_verdict(runs: pl.DataFrame, verdict: RunVerdict | None, low: flo
     return figures | {"lost": lost_words(row["lost_to"], row["lost_to_share"], row["lost_to_monitor"], 1.0 - available)}
 
 
-def _why(runs: pl.DataFrame, verdict: RunVerdict | None) -> str:
-    """What decides the verdict, of each solution that has it."""
-    if verdict is None:
-        return ""
-    rows = runs.filter(pl.col("verdict").cast(pl.String) == verdict.value)
-    several = runs.height > 1
-    return "; ".join(
-        (f"{row['solution']}: " if several else "") + reason_words(row) for row in rows.iter_rows(named=True)
-    )
+def _why(rows: Sequence[Mapping[str, Any]], several: bool) -> str:
+    """What decides the verdict, of each solution that has it; `several`: of several, so that they are named."""
+    return "; ".join((f"{row['solution']}: " if several else "") + reason_words(row) for row in rows)
 
 
 def failed_tables(job: RunJob, error: str) -> RunTables:

@@ -58,7 +58,7 @@ def stem_of(path: Address) -> str:
 
 def join(path: Address, name: str) -> Address:
     """What has this name in a folder."""
-    return f"{str(path).rstrip('/')}/{name}" if is_url(path) else Path(path) / name
+    return f"{str(path).rstrip('/')}/{name}" if is_url(path) else Path(path, name)
 
 
 def is_geojson(address: Address) -> bool:

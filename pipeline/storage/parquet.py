@@ -165,11 +165,11 @@ class TableReader:
         self._wanted: list[str] = []
         self.heights: list[int] = []
 
-    def add(self, source: bytes | Path) -> None:
-        """Read one more. Raises `ParquetError`."""
+    def add(self, source: bytes | Path, metadata: pq.FileMetaData | None = None) -> None:
+        """Read one more; `metadata`: its own, where it was read already. Raises `ParquetError`."""
         with _reading():
             place = pa.BufferReader(source) if isinstance(source, bytes) else source
-            file = pq.ParquetFile(place, page_checksum_verification=True)
+            file = pq.ParquetFile(place, metadata=metadata, page_checksum_verification=True)
             kind = file.schema_arrow.remove_metadata()
             # What polars makes of a column stands in the field's metadata.
             if self._kind is None or not kind.equals(self._kind, check_metadata=True):
@@ -185,7 +185,8 @@ class TableReader:
             return pl.DataFrame(height=sum(self.heights))
         with _reading():
             whole = self._tables[0] if len(self._tables) == 1 else pa.concat_tables(self._tables).combine_chunks()
-            return pl.DataFrame(pl.from_arrow(whole)).select(self._wanted)
+            frame = pl.DataFrame(pl.from_arrow(whole))
+            return frame if frame.columns == self._wanted else frame.select(self._wanted)
 
     def _names(self, kind: pa.Schema) -> list[str]:
         names = list(kind.names)
@@ -196,17 +197,7 @@ class TableReader:
 
 def metadata_of(content: bytes) -> dict[str, str]:
     """The file's key-value metadata. Raises `ParquetError`."""
-    with _reading():
-        metadata = pq.read_metadata(pa.BufferReader(content)).metadata or {}
-        return {name.decode(errors="replace"): value.decode(errors="replace") for name, value in metadata.items()}
-
-
-def rows_of(content: bytes) -> int:
-    """How many rows the file declares: its size says nothing of that. Raises `ParquetError`."""
-    with _reading():
-        metadata = pq.read_metadata(pa.BufferReader(content))
-        groups = (metadata.row_group(number).num_rows for number in range(metadata.num_row_groups))
-        return int(max(metadata.num_rows, sum(groups)))
+    return TableFile(content).notes
 
 
 def unpacked_size(content: bytes) -> int:
@@ -214,11 +205,9 @@ def unpacked_size(content: bytes) -> int:
 
     Values that are the same in every row take hardly anything in the file. Raises `ParquetError`.
     """
+    file = TableFile(content)
     with _reading():
-        metadata = pq.read_metadata(pa.BufferReader(content))
-        groups = [metadata.row_group(number) for number in range(metadata.num_row_groups)]
-        values: int = sum(group.column(number).num_values for group in groups for number in range(metadata.num_columns))
-    return max(values, rows_of(content)) * _BYTES_OF_A_VALUE
+        return max(file.values, file.rows) * _BYTES_OF_A_VALUE
 
 
 def end_of(source: Path | IO[bytes]) -> bytes:
@@ -242,11 +231,55 @@ def metadata_in(end: bytes) -> pq.FileMetaData:
 
 def without_checksums(content: bytes) -> bool:
     """Whether some column has no checksum, so that damage to it may go unnoticed. Raises `ParquetError`."""
-    with _reading():
-        metadata = pq.read_metadata(pa.BufferReader(content))
-        groups = (metadata.row_group(number) for number in range(metadata.num_row_groups) if metadata.num_rows)
-        parts = (group.column(number) for group in groups for number in range(metadata.num_columns))
-        return not all(_has_crc(content[part.data_page_offset :][:32]) for part in parts)
+    return TableFile(content).without_checksums
+
+
+class TableFile:
+    """One file in memory, whose metadata is read once. All of it raises `ParquetError`."""
+
+    def __init__(self, content: bytes) -> None:
+        self._content = content
+        with _reading():
+            self._metadata = pq.read_metadata(pa.BufferReader(content))
+
+    @property
+    def notes(self) -> dict[str, str]:
+        """The key-value metadata."""
+        metadata = self._metadata.metadata or {}
+        return {name.decode(errors="replace"): value.decode(errors="replace") for name, value in metadata.items()}
+
+    @property
+    def rows(self) -> int:
+        """How many rows the file declares: its size says nothing of that."""
+        with _reading():
+            return int(max(self._metadata.num_rows, sum(group.num_rows for group in self._groups())))
+
+    @property
+    def values(self) -> int:
+        """How many values the file declares."""
+        with _reading():
+            return sum(part.num_values for group in self._groups() for part in self._parts(group))
+
+    @property
+    def without_checksums(self) -> bool:
+        """Whether some column has no checksum, so that damage to it may go unnoticed."""
+        if not self._metadata.num_rows:
+            return False
+        with _reading():
+            parts = (part for group in self._groups() for part in self._parts(group))
+            return not all(_has_crc(self._content[part.data_page_offset :][:32]) for part in parts)
+
+    def frame(self, choose: Callable[[ColumnTypes], Sequence[str]] | None = None) -> pl.DataFrame:
+        """The table; of all its columns and their types `choose` says which are read."""
+        reader = TableReader(choose)
+        reader.add(self._content, self._metadata)
+        return reader.frame()
+
+    def _groups(self) -> Iterator[pq.RowGroupMetaData]:
+        return (self._metadata.row_group(number) for number in range(self._metadata.num_row_groups))
+
+    def _parts(self, group: pq.RowGroupMetaData) -> Iterator[pq.ColumnChunkMetaData]:
+        return (group.column(number) for number in range(self._metadata.num_columns))
 
 
 def _has_crc(head: bytes) -> bool:

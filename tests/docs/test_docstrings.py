@@ -19,8 +19,9 @@ from pipeline.stages.judge.episodes import alarms_table, find_episodes
 from pipeline.stages.judge.epochs import judged_epochs, judged_offers, time_in_use
 from pipeline.stages.judge.failures import find_failures
 from pipeline.stages.judge.hazards import hazard_rows, hazards_table
-from pipeline.stages.judge.judge import crossings_of, judge, passages_table
+from pipeline.stages.judge.judge import judge, passages_table
 from pipeline.stages.judge.judgement import judge_positions
+from pipeline.stages.judge.train_crossings import crossings_of
 from pipeline.stages.matching.match import find_path
 from pipeline.stages.monitored import monitor_solution
 from pipeline.stages.monitors.axes import axes_of

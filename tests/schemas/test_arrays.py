@@ -23,5 +23,5 @@ def test_the_median_is_that_of_numpy_to_the_last_bit(size: int) -> None:
 
 def test_rows_of_no_run_make_a_table_of_the_same_columns() -> None:
     kinds = dtypes(Hazards)
-    assert table_of_rows([], kinds).schema == pl.DataFrame([dict.fromkeys(kinds)], schema=kinds).schema
-    assert table_of_rows([{"hazard_id": 3}], {"hazard_id": kinds["hazard_id"]})["hazard_id"].to_list() == [3]
+    assert table_of_rows([], Hazards).schema == pl.DataFrame([dict.fromkeys(kinds)], schema=kinds).schema
+    assert table_of_rows([{"hazard_id": 3}], Hazards)["hazard_id"].to_list() == [3]

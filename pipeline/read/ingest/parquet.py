@@ -11,8 +11,8 @@ from pipeline.read.ingest.correct import read_corrections, read_damage, read_raw
 from pipeline.read.ingest.wraps import whole_stream
 from pipeline.storage import files
 from pipeline.storage.address import Address, join, stem_of
-from pipeline.storage.described import notes_of
-from pipeline.storage.parquet import ColumnTypes, ParquetError, read_parquet, rows_of, without_checksums
+from pipeline.storage.described import noted
+from pipeline.storage.parquet import ColumnTypes, ParquetError, TableFile
 from schemas.config import IngestConfig, StreamCorrection
 from schemas.conform import dtypes
 from schemas.errors import InputError
@@ -41,17 +41,18 @@ def read_folder(path: Address, config: IngestConfig, with_digest: bool = True) -
         if with_digest:
             digest.update(f"{stream}:{len(content)}:".encode())
             digest.update(content)
-        recorded = _read(content, stream, str(file), config, breaches)
-        if recorded is not None:
+        stored = _stored(content, str(file), breaches)
+        recorded = None if stored is None else _read(stored, stream, str(file), config, breaches)
+        if stored is not None and recorded is not None:
             frames[stream] = conform(recorded, stream, str(file), breaches)
             if stream == "odometer" and not breaches:
                 frames[stream], wraps = whole_stream(frames[stream], config)
                 skipped += [f"odometer.parquet: {said}" for said in wraps]
-            said = notes_of(content)
+            said = noted(stored.notes)
             held += read_corrections(said, stream, str(file))
             raw_logs += read_raw_logs(said)
-            damages += [*filter(None, [read_damage(said)]), *_lost(stream, content, recorded)]
-            unproved += [f"{stream}.parquet"] if without_checksums(content) else []
+            damages += [*filter(None, [read_damage(said)]), *_lost(stream, stored.rows, recorded)]
+            unproved += [f"{stream}.parquet"] if stored.without_checksums else []
             skipped += [f"{stream}.parquet: column {name}" for name in recorded.columns if not _is_known(name, stream)]
     refuse(breaches)
     skipped += sorted(present - {f"{stream}.parquet" for stream in STREAMS})
@@ -69,9 +70,8 @@ def read_folder(path: Address, config: IngestConfig, with_digest: bool = True) -
     ).with_streams(**frames)
 
 
-def _lost(stream: Stream, content: bytes, recorded: pl.DataFrame) -> list[str]:
+def _lost(stream: Stream, declared: int, recorded: pl.DataFrame) -> list[str]:
     """Rows that a file declares and does not hold."""
-    declared = rows_of(content)
     return [f"{stream}.parquet holds {recorded.height} of {declared} rows that are declared"] * (
         recorded.height < declared
     )
@@ -87,12 +87,22 @@ def _no_gnss(path: Address, present: set[str]) -> InputError:
     )
 
 
-def _read(
-    content: bytes, stream: Stream, place: str, config: IngestConfig, breaches: list[InputError]
-) -> pl.DataFrame | None:
+def _stored(content: bytes, place: str, breaches: list[InputError]) -> TableFile | None:
+    """The file with its metadata; None after a breach."""
     if not content:
         breaches.append(InputError("is empty", place=place, found="0 bytes", expected="a Parquet file"))
         return None
+    try:
+        return TableFile(content)
+    except ParquetError as error:
+        breaches.append(_unreadable(error, place))
+        return None
+
+
+def _read(
+    stored: TableFile, stream: Stream, place: str, config: IngestConfig, breaches: list[InputError]
+) -> pl.DataFrame | None:
+    """The columns of the contract, and those beside it without their values; None after a breach."""
     others: list[str] = []
 
     def known(types: ColumnTypes) -> list[str]:
@@ -100,14 +110,16 @@ def _read(
         return [name for name in types if _is_known(name, stream)]
 
     try:
-        refuse_too_many(rows_of(content), place, config)
-        frame = read_parquet(content, known)
+        refuse_too_many(stored.rows, place, config)
+        frame = stored.frame(known)
     except ParquetError as error:
-        breaches.append(
-            InputError(f"cannot be read as Parquet ({error})", place=place, remedy="Record or copy the file again.")
-        )
+        breaches.append(_unreadable(error, place))
         return None
-    return frame.with_columns(pl.lit(None).alias(name) for name in others)
+    return frame.with_columns(pl.lit(None).alias(name) for name in others) if others else frame
+
+
+def _unreadable(error: ParquetError, place: str) -> InputError:
+    return InputError(f"cannot be read as Parquet ({error})", place=place, remedy="Record or copy the file again.")
 
 
 def _is_known(column: str, stream: Stream) -> bool:

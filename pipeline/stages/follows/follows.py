@@ -267,10 +267,8 @@ def _ratio(steps: Steps, config: EvidenceConfig) -> float | None:
         up_m = np.nan_to_num(steps.up_m)
         if np.ptp(up_m[rows]) > _LEAST_M:
             alone_m.append(_unexplained(up_m[rows], _neighbours(up_m, rows, _OWN)) / _HEIGHT_OVER_CROSS)
-    return max(
-        max(_sigma_m(left_m, *quantile), _LEAST_M) / max(min(_sigma_m(m, *quantile) for m in alone_m), 1e-9)
-        for quantile in _QUANTILES
-    )
+    least_alone_m = np.min([_sigmas_m(residuals_m) for residuals_m in alone_m], axis=0)
+    return float(np.max(np.maximum(_sigmas_m(left_m), _LEAST_M) / np.maximum(least_alone_m, 1e-9)))
 
 
 def _in_motion(steps: Steps) -> Ints:
@@ -308,6 +306,7 @@ def _unexplained(wanted_m: Floats, by_m: Floats) -> Floats:
     return np.asarray(np.abs(wanted - columns @ weights) * np.sqrt(count / (count - fitted - 1.0)))
 
 
-def _sigma_m(residuals_m: Floats, part: float, of_normal: float) -> float:
-    """Sigma [m] of a normal variable whose absolute value has this quantile; `of_normal`: that of sigma 1."""
-    return float(np.quantile(residuals_m, part)) / of_normal
+def _sigmas_m(residuals_m: Floats) -> Floats:
+    """Sigma [m] of a normal variable whose absolute value has these quantiles, by each of `_QUANTILES`."""
+    parts, of_normal = zip(*_QUANTILES, strict=True)
+    return np.asarray(np.quantile(residuals_m, parts) / np.array(of_normal))

@@ -11,7 +11,8 @@ tables. Touches no file. Velocity, and scale and latency learned in the run, dec
 
 | question | module |
 |---|---|
-| in which order is it judged; when did the train itself pass each balise, and what became of each passage | `judge` |
+| in which order is it judged; what became of each passage | `judge` |
+| when did the train itself pass each balise | `train_crossings` |
 | what is judged, and by what; was a position right | `judgement` |
 | in which arrays does what is judged go on | `judged` |
 | per epoch and offer: in which direction did the train move, was the position in use, how far off across | `epochs` |

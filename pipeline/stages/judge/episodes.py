@@ -15,7 +15,7 @@ from pipeline.stages.judge.judged import ODOMETER, WRONG, JudgedEpochs
 from pipeline.stages.judge.judgement import healthy_margins_m
 from schemas.arrays import NS_PER_S, Bools, Floats, spans_of
 from schemas.config import Configuration, HazardConfig
-from schemas.conform import dtypes, table_of_rows
+from schemas.conform import table_of_rows
 from schemas.enums import Suspect, Verdict
 from schemas.frozen import frozen
 from schemas.stages import MatchedEpochs
@@ -257,7 +257,7 @@ def alarms_table(
         }
         for number, alarm in enumerate(log.alarms)
     ]
-    return table_of_rows(rows, dtypes(Alarms))
+    return table_of_rows(rows, Alarms)
 
 
 def _place_columns(epochs: MatchedEpochs, epoch: int) -> dict[str, object]:

@@ -17,7 +17,7 @@ from pipeline.stages.judge.failures import ErrorHistory, Jump
 from pipeline.stages.judge.judged import JudgedEpochs, JudgedOffers
 from pipeline.stages.judge.judgement import JudgeInput
 from schemas.arrays import NS_PER_S
-from schemas.conform import dtypes, table_of_rows
+from schemas.conform import table_of_rows
 from schemas.enums import Evidence, FailureMode, Hazard, Timing
 from schemas.tables import Hazards
 
@@ -191,7 +191,7 @@ def hazards_table(
         }
         for number, row in enumerate(rows)
     ]
-    return table_of_rows(values, dtypes(Hazards))
+    return table_of_rows(values, Hazards)
 
 
 def _class_columns(row: HazardRow, offers: JudgedOffers) -> Row:

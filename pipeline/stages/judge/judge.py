@@ -1,27 +1,27 @@
-"""The judge of one solution; its passages with the train's own crossings (CONTRACT section 3, `t_true`)."""
+"""One solution judged, step by step, and what became of each passage of a balise."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from enum import StrEnum
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import polars as pl
 
-from pipeline.stages.epochs.clock import crossing_gaps_ns, passings
+from pipeline.stages.epochs.clock import crossing_gaps_ns
 from pipeline.stages.epochs.verdicts import failure_log
-from pipeline.stages.evidence.evidence import KINDS, NOTHING, Alternative, EvidenceSet, Span, inside_spans
+from pipeline.stages.evidence.evidence import KINDS, NOTHING, Span, inside_spans
 from pipeline.stages.judge.episodes import alarms_table, find_episodes
 from pipeline.stages.judge.epochs import judged_epochs, judged_offers, odometer_steps, speed_at_mps
 from pipeline.stages.judge.failures import Failure, error_history, find_failures
 from pipeline.stages.judge.hazards import HazardRow, hazard_rows, hazards_table
 from pipeline.stages.judge.judged import JudgedEpochs, JudgedOffers
 from pipeline.stages.judge.judgement import JudgeInput
-from pipeline.stages.track.path import Place
-from schemas.arrays import NS_PER_S, Bools, Floats, Ints, ints, truths
-from schemas.config import Configuration, LdsConfig
+from pipeline.stages.judge.train_crossings import Crossings, TrueCrossing, crossings_of
+from schemas.arrays import Bools, Ints, ints, truths
+from schemas.config import LdsConfig
 from schemas.conform import dtypes
 from schemas.enums import (
     BaliseKind,
@@ -37,144 +37,6 @@ from schemas.enums import (
 from schemas.frozen import frozen
 from schemas.stages import AlignedEpochs
 from schemas.tables import Passages
-
-# Numerics: so many instants before and after a track show where the train came from and went on to.
-_NEIGHBOURS = 100
-
-
-class TrueCrossing(NamedTuple):
-    """Instant [ns] by the middle of the interval; `sense` +1 with the measure of the balise's net element, else -1.
-
-    `clear`: the train came from beyond the re-arming distance and went on beyond it.
-    """
-
-    t_ns: int
-    sense: int
-    clear: bool
-
-
-Crossings = dict[str, list[TrueCrossing]]
-"""Of each balise, in order of time."""
-
-
-def crossings_of(given: JudgeInput) -> Crossings:
-    """Crossings of each balise of the path by the train, in a direction in which the balise is valid.
-
-    Args:
-        given: the balises of the path, and the evidence.
-
-    Returns:
-        Crossings of each balise in order of time.
-    """
-    balises = given.solution.balises.unique("balise_id", keep="first")
-    index = given.evidence.network.track.index
-    elements = [index.get(name, -1) for name in balises["netelement_id"]]
-    spots = zip(balises["balise_id"], elements, balises["measure_m"], strict=True)
-    places = {name: Place(element, measure_m) for name, element, measure_m in spots}
-    at_ns = with_instants_between(given.epochs_valid_at_ns(), given.config.align.speed_window_s)
-    crossings = true_crossings(at_ns, given.evidence.at(at_ns), places, given.config)
-    # `valid_direction` is along the path, `sense` of a crossing along the measure; 0 is both directions.
-    valid = dict(balises.select("balise_id", pl.col("valid_direction") * pl.col("sense")).iter_rows())
-    return {
-        name: [crossing for crossing in crossed if valid[name] in (0, crossing.sense)]
-        for name, crossed in crossings.items()
-    }
-
-
-def with_instants_between(at_ns: Ints, step_s: float) -> Ints:
-    """The instants of the positions [ns], and others every `step_s` between those that are farther apart."""
-    step_ns = round(step_s * NS_PER_S)
-    far = np.flatnonzero(np.diff(at_ns) > 1.5 * step_ns)
-    gaps = zip(at_ns[far].tolist(), at_ns[far + 1].tolist(), strict=True)
-    between = [np.arange(begin, end, step_ns, dtype=np.int64)[1:] for begin, end in gaps]
-    return np.unique(np.concatenate([at_ns, *between]))
-
-
-class _Train(NamedTuple):
-    """Where the train was at each instant, NaN where not known: net element, measure, half the interval."""
-
-    t_ns: Ints
-    element: Floats
-    measure_m: Floats
-    half_m: Floats
-
-
-def true_crossings(t_ns: Ints, evidence: EvidenceSet, places: dict[str, Place], config: Configuration) -> Crossings:
-    """Crossings of balises at `places` by the train, where the evidence (at instants `t_ns`) leaves one track.
-
-    Where the half interval is at most `known_error_m`, its middle counts; else the whole interval has to pass from one
-    side of the balise to the other.
-    """
-    alternatives = np.bincount(
-        np.concatenate([track.rows for track in evidence.alternatives] or [np.zeros(0, np.int64)]), minlength=t_ns.size
-    )
-    tracks = [track.some_rows(alternatives[track.rows] == 1) for track in evidence.alternatives]
-    train = _Train(t_ns, *np.full((3, t_ns.size), np.nan))
-    for track in tracks:
-        train.element[track.rows], train.measure_m[track.rows], _ = track.route.locate(track.middle_m)
-        train.half_m[track.rows] = 0.5 * (track.high_m - track.low_m)
-    names = list(places)
-    elements = np.array([place.element for place in places.values()])
-    measures_m = np.array([place.measure_m for place in places.values()])
-    crossings: Crossings = {name: [] for name in names}
-    for track in tracks:
-        if track.rows.size == 0:
-            continue
-        rows, at_m = _rows_about_track(track, train)
-        on_track = np.isin(rows, track.rows)
-        for balise, visit_m, sense in zip(*track.route.visits_of_places(elements, measures_m), strict=True):
-            if at_m.min() <= visit_m <= at_m.max():
-                crossed = _crossings_of_place(train, rows, on_track, at_m - visit_m, config)
-                turned = [crossing._replace(sense=int(crossing.sense * sense)) for crossing in crossed]
-                crossings[names[balise]] += turned
-    return {name: sorted(crossed) for name, crossed in crossings.items()}
-
-
-def _rows_about_track(track: Alternative, train: _Train) -> tuple[Ints, Floats]:
-    """Rows of the train on a track and of the instants just before and after, with their coordinates on it [m]."""
-    rows = track.rows
-    around = np.arange(max(rows[0] - _NEIGHBOURS, 0), min(rows[-1] + _NEIGHBOURS + 1, train.t_ns.size))
-    neighbours = np.setdiff1d(around, rows)
-    element = np.nan_to_num(train.element[neighbours], nan=-1).astype(np.int64)
-    near_m = track.middle_m[np.searchsorted(rows, neighbours).clip(0, rows.size - 1)]
-    there_m, _ = track.route.coordinates_of(element, train.measure_m[neighbours], near_m)
-    known = np.isfinite(there_m)
-    both = np.concatenate([rows, neighbours[known]])
-    order = np.argsort(both, kind="stable")
-    return both[order], np.concatenate([track.middle_m, there_m[known]])[order]
-
-
-def _crossings_of_place(
-    train: _Train, rows: Ints, on_track: Bools, away_m: Floats, config: Configuration
-) -> list[TrueCrossing]:
-    """The train's crossings of one balise, `away_m` from it, at those of the rows that are `on_track`.
-
-    A train that came no farther than `rearm_m` from a balise since it passed it has not passed it again.
-    """
-    half_m = train.half_m[rows]
-    close = half_m <= config.hazards.known_error_m
-    beyond = np.abs(away_m) >= np.maximum(config.lds.rearm_m, half_m)
-    ahead = away_m >= 0.0
-    crossings: list[TrueCrossing] = []
-    armed_from = 0
-    passed = False
-    far = np.flatnonzero(beyond)
-    for passing in passings(away_m, [0.0]):
-        change = passing.after
-        if rows[change] - rows[change - 1] != 1:
-            continue
-        armed = bool((beyond & (ahead != ahead[change]))[armed_from:change].any())
-        # However often its middle wavers at the balise: on which side the train is next known to be beyond it.
-        next_far = int(np.searchsorted(far, change))
-        clear = armed and next_far < far.size and bool(ahead[far[next_far]] == ahead[change])
-        if not clear and not (close[change - 1 : change + 1].all() and (armed or not passed)):
-            continue
-        armed_from = change
-        passed = True
-        if on_track[change]:
-            instant_ns = passing.instant_ns(*train.t_ns[rows[change - 1 : change + 1]].tolist())
-            crossings.append(TrueCrossing(instant_ns, passing.sense, clear))
-    return crossings
 
 
 def passages_table(
@@ -206,7 +68,7 @@ def passages_table(
     t_true = passages["t_true"]
     virtual = _equal_to(passages["kind"], BaliseKind.VIRTUAL)
     accepted = virtual & _equal_to(passages["status"], PassageStatus.ACCEPTED)
-    offered_ns = ints(passages["t_offered"].dt.timestamp("ns"))
+    offered_ns = ints(passages["t_offered"].cast(pl.Int64))
     positioned = _is_interpolated(stamps, ints(t_true), given.config.lds) & t_true.is_not_null().to_numpy()
     of_offers, inserted = _offer_columns(passages, offers, rows)
     frame = passages.with_columns(
@@ -251,7 +113,7 @@ def _offer_columns(
 
 def _null_for_nothing(numbers: Ints) -> pl.Series:
     """Numbers as a column, null for `NOTHING`."""
-    return pl.Series(numbers, dtype=pl.Int64).replace(NOTHING, None)
+    return pl.Series(numbers).set(pl.Series(numbers == NOTHING), None)
 
 
 def _take_true_times(passages: pl.DataFrame, crossings: Crossings) -> pl.Series:
@@ -259,7 +121,7 @@ def _take_true_times(passages: pl.DataFrame, crossings: Crossings) -> pl.Series:
 
     A passage with neither takes what is left, in order.
     """
-    about = passages.select(pl.coalesce("t_offered", "t_reckoned")).to_series().dt.timestamp("ns").to_list()
+    about = passages.select(pl.coalesce("t_offered", "t_reckoned")).to_series().cast(pl.Int64).to_list()
     balises = passages["balise_id"].to_list()
     pairs = sorted(
         (abs(crossing.t_ns - t_ns), row, crossing)
@@ -289,7 +151,7 @@ def _is_interpolated(stamps: Ints, t_ns: Ints, lds: LdsConfig) -> Bools:
 
 def _passage_speeds_mps(passages: pl.DataFrame, t_true: pl.Series, epochs: AlignedEpochs, lds: LdsConfig) -> pl.Series:
     """Speed of the train at the offer, else where it passed [m/s]; null in a gap of the epochs."""
-    at = passages["t_offered"].dt.timestamp("ns").fill_null(t_true)
+    at = passages["t_offered"].cast(pl.Int64).fill_null(t_true)
     stamps = epochs.t_ns[np.isfinite(epochs.speed_mps)]
     known = at.is_not_null().to_numpy() & _is_interpolated(stamps, ints(at), lds)
     return pl.Series("speed_mps", np.where(known, speed_at_mps(epochs, ints(at)), np.nan), nan_to_null=True)

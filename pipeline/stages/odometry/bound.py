@@ -52,12 +52,16 @@ class OddRuns(NamedTuple):
 
 
 class _CounterRows(NamedTuple):
-    """Rows of a counter without gaps, its step as known before each, and what second differences scatter by [m]."""
+    """Rows of a counter without gaps, its step as known before each, and what second differences scatter by [m].
+
+    `period_s`: mean period of the rows before each step.
+    """
 
     t_s: Floats
     distance_m: Floats
     counts_m: Floats
     scatter_m: Floats  # of interior rows
+    period_s: Floats
 
 
 def driven_within_m(time_s: float, config: AlignConfig, about_s: float | None = None) -> float:
@@ -89,7 +93,11 @@ def odd_runs(t_s: Floats, distance_m: Floats, counts_m: Floats | float, config: 
     counts_m = np.broadcast_to(counts_m, t_s.shape)[rows]
     t_s, distance_m = t_s[rows], distance_m[rows]
     before_m = np.concatenate([counts_m[:1], counts_m[:-1]])
-    counted = _CounterRows(t_s, distance_m, before_m, _scatter_m(t_s, distance_m, before_m, config))
+    period_s = _periods_s(t_s, config)
+    scatter_m = _scatter_m(t_s, distance_m, before_m)
+    # Rows farther apart differ by how the train drives.
+    scatter_m = np.where(period_s[1:] > config.straight_s, 0.0, scatter_m)
+    counted = _CounterRows(t_s, distance_m, before_m, scatter_m, period_s)
     leaps, _ = _places(counted, config)
     # Near ones are for evidence, which may look back: a counter whose step is not yet known is healthy all the same.
     _, near = _places(counted._replace(counts_m=np.maximum(before_m, counts_m[-1])), config)
@@ -108,7 +116,7 @@ def _in_all_rows(run: OddRun, rows: Ints) -> OddRun:
     return run._replace(first=int(rows[run.first]), last=int(rows[run.last]))
 
 
-def _scatter_m(t_s: Floats, distance_m: Floats, counts_m: Floats, config: AlignConfig) -> Floats:
+def _scatter_m(t_s: Floats, distance_m: Floats, counts_m: Floats) -> Floats:
     """Sigma of the second difference at each interior row, from the rows before; a counter's own step left out.
 
     By third differences: constant braking has none.
@@ -120,9 +128,7 @@ def _scatter_m(t_s: Floats, distance_m: Floats, counts_m: Floats, config: AlignC
     median_m[:_FIRST_ROWS] = median_m[min(_FIRST_ROWS, median_m.size) - 1]
     variance_m2 = _SECOND / _THIRD * (median_m / _MEDIAN_SIGMAS) ** 2
     variance_m2 = np.concatenate([variance_m2[:1], variance_m2]) - counts_m[1:-1] ** 2
-    scatter_m = np.sqrt(np.maximum(variance_m2, 0.0) + _by_stamps_m(t_s, distance_m) ** 2)
-    # Rows farther apart differ by how the train drives.
-    return np.where(_periods_s(t_s, config)[1:] > config.straight_s, 0.0, scatter_m)
+    return np.sqrt(np.maximum(variance_m2, 0.0) + _by_stamps_m(t_s, distance_m) ** 2)
 
 
 def _by_stamps_m(t_s: Floats, distance_m: Floats) -> Floats:
@@ -157,7 +163,7 @@ def _places(counted: _CounterRows, config: AlignConfig) -> tuple[Bools, Bools]:
     least_s = np.minimum(dt_s[1:], dt_s[:-1])
     # Beyond what braking explains: |dv| T - b (T1 + T2) / 2 T, T the shorter of both steps.
     apart_m = np.abs(np.diff(speed_mps)) * least_s - 0.5 * config.braking_mps2 * (dt_s[1:] + dt_s[:-1]) * least_s
-    bunched = least_s < 0.5 * _periods_s(counted.t_s, config)[1:]
+    bunched = least_s < 0.5 * counted.period_s[1:]
     rows_m = 2.0 * counted.counts_m[1:-1] + config.sure_sigmas * counted.scatter_m
     leap = apart_m > rows_m + np.where(bunched, config.bunched_stamps_m, config.leap_m)
     near = (apart_m > rows_m + config.near_leap_m) & ~bunched
@@ -225,9 +231,8 @@ def _stalls(counted: _CounterRows, config: AlignConfig) -> tuple[Bools, Bools]:
 
 def _set_in_a_hole(counted: _CounterRows, odd: Bools, config: AlignConfig) -> Bools:
     """Steps over missing rows: the short step next to one shows little of a leap in it."""
-    t_s, distance_m = counted.t_s, counted.distance_m
+    t_s, distance_m, period_s = counted.t_s, counted.distance_m, counted.period_s
     dt_s = np.diff(t_s)
-    period_s = _periods_s(t_s, config)
     bunched = dt_s < 0.5 * period_s
     next_to_bunched = bunched | np.append(bunched[1:], False) | np.append([False], bunched[:-1])
     hole = (dt_s > config.odometer_gap_periods * period_s) & (dt_s <= config.odometer_gap_s) & ~(odd | next_to_bunched)
@@ -286,7 +291,8 @@ class _Sums(NamedTuple):
 
 def weighed(t_s: Floats, distance_m: Floats, steps: Bools, config: AlignConfig) -> list[OddRun]:
     """Each run of these steps (pauses, slip) by the mean speed around it."""
-    counted = _CounterRows(t_s, distance_m, np.zeros(t_s.size), np.zeros(max(t_s.size - 2, 1)))
+    scatter_m = np.zeros(max(t_s.size - 2, 1))
+    counted = _CounterRows(t_s, distance_m, np.zeros(t_s.size), scatter_m, _periods_s(t_s, config))
     return _runs(counted, steps, steps, config)
 
 

@@ -99,9 +99,10 @@ class CounterRows:
     def speeds(self, t_s: Floats) -> tuple[Floats, Floats]:
         """Speed about each instant, and by the rows next to these."""
         half_s = self._half_s
-        near = self.gained(t_s - half_s, t_s + half_s) / (2.0 * half_s)
-        before, after = (self.gained(t_s + a * half_s, t_s + b * half_s) for a, b in ((-4, -2), (2, 4)))
-        return near, (before + after) / (4.0 * half_s)
+        ends = np.array([[-4.0, -1.0, 2.0], [-2.0, 1.0, 4.0]]) * half_s
+        begin_s, end_s = t_s + ends.reshape(2, 3, *(1,) * t_s.ndim)
+        before, near, after = self.gained(begin_s, end_s)
+        return near / (2.0 * half_s), (before + after) / (4.0 * half_s)
 
     @cached_property
     def smooth(self) -> CounterRows:
@@ -345,7 +346,7 @@ class _DistancePairs:
         """The estimate at an assumed lag; `doubt_s`: by how much it may be off, which makes no outlier."""
         begin_s, end_s = self.begin_s - lag_s, self.end_s - lag_s
         counted = self.counter.gained(begin_s, end_s)
-        (first, first_instrument), (last, last_instrument) = self.counter.speeds(begin_s), self.counter.speeds(end_s)
+        (first, last), (first_instrument, last_instrument) = self.counter.speeds(np.stack([begin_s, end_s]))
         design = np.column_stack(slopes(counted, last - first))
         change_mps = last_instrument - first_instrument
         # The counts of a coarse counter at one speed have a rhythm, in speeds as in movements: no changes of speed.
@@ -367,7 +368,7 @@ class _DistancePairs:
             if kept.sum() < FEWEST:
                 return None
             solved = solved_moments(design[kept], instruments[kept], self.moved_m[kept])
-            same = np.array_equal(kept, used) and np.allclose(solved, theta, rtol=1e-9, atol=1e-9)
+            same = np.array_equal(kept, used) and bool(np.all(np.abs(solved - theta) <= 1e-9 + 1e-9 * np.abs(theta)))
             theta, used = solved, kept
             if same:
                 break

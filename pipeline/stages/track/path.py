@@ -192,11 +192,14 @@ def valid_along_measure(balises: pl.DataFrame) -> pl.Series:
 
     0 both: a physical one, which every train reads, and one of a table that does not say (CONTRACT section 2).
     """
-    both = pl.Series([BaliseDirection.BOTH.value]).new_from_index(0, balises.height)
-    direction = balises.get_column("direction", default=both).cast(pl.String)
-    along = direction.replace_strict(_ALONG_MEASURE, return_dtype=pl.Int64)
-    virtual = balises["kind"].cast(pl.String) == BaliseKind.VIRTUAL.value
-    return along * virtual.cast(pl.Int64)
+    said = "direction" in balises.columns
+    directions = balises["direction"].to_list() if said else [BaliseDirection.BOTH.value] * balises.height
+    kinds = balises["kind"].to_list()
+    along = [
+        _ALONG_MEASURE[direction] if kind == BaliseKind.VIRTUAL.value else 0
+        for direction, kind in zip(directions, kinds, strict=True)
+    ]
+    return pl.Series(along, dtype=pl.Int64)
 
 
 _ALONG_MEASURE = {BaliseDirection.AB.value: 1, BaliseDirection.BA.value: -1, BaliseDirection.BOTH.value: 0}
@@ -378,13 +381,13 @@ class TravelledPath:
         """
         if balises is None:
             return pl.DataFrame(schema=BALISE_COLUMNS)
-        element = balises["netelement_id"].replace_strict(self.track.index, default=-1, return_dtype=pl.Int64)
+        element = np.array([self.track.index.get(name, -1) for name in balises["netelement_id"]], dtype=np.int64)
+        valid = valid_along_measure(balises).to_numpy()
         parts = []
         for leg, route in enumerate(self.routes_by_leg(self.track.index)):
-            place, path_m, sense = route.visits_of_places(element.to_numpy(), floats(balises, "measure_m"))
-            along_path = valid_along_measure(balises)[place] * pl.Series(sense)
-            on_leg = balises[place].with_columns(leg=pl.lit(leg), path_m=path_m, sense=sense)
-            parts.append(on_leg.with_columns(valid_direction=along_path))
+            place, path_m, sense = route.visits_of_places(element, floats(balises, "measure_m"))
+            columns = {"path_m": path_m, "sense": sense, "valid_direction": valid[place] * sense}
+            parts.append(balises[place].with_columns(leg=pl.lit(leg), **columns))
         whole = pl.concat(parts).select(pl.col(name).cast(kind) for name, kind in BALISE_COLUMNS.items())
         # Where two pieces of an element meet they share a place.
         once = whole.unique(["leg", "balise_id", pl.col("path_m").round(3)], keep="first", maintain_order=True)

@@ -225,8 +225,7 @@ def _fitted(gnss: Places, counter: Record, lag_s: float) -> PairFit:
     begin_s, end_s = _common(gnss, counter, lag_s)
     if end_s - begin_s < 3.0 * _WINDOW_LEAST_S:
         return PairFit(reason="nothing in common")
-    starts, ends = _windows(gnss, begin_s, end_s)
-    distance_m = gnss.distance_m(starts, ends)
+    starts, ends, distance_m = _windows(gnss, begin_s, end_s)
     found = scale_and_lag(starts, ends, distance_m, _driven(counter, lag_s))
     counted = counter.gained(starts + lag_s - found.lag_s, ends + lag_s - found.lag_s)
     known = np.isfinite(counted)
@@ -257,18 +256,18 @@ def _driven(counter: Record, lag_s: float) -> CounterRows:
     return CounterRows(counter.t_s - lag_s, counter.values, np.concatenate([[0.0], np.cumsum(paused)])).driven()
 
 
-def _windows(gnss: Places, begin_s: float, end_s: float) -> tuple[Floats, Floats]:
-    """Begins and ends of windows in which the positions move."""
+def _windows(gnss: Places, begin_s: float, end_s: float) -> tuple[Floats, Floats, Floats]:
+    """Begins and ends of windows in which the positions move, and the distance run in each [m]."""
     speed = gnss.speed(np.linspace(begin_s, end_s, 400))
     fast = speed[np.nan_to_num(speed) > MOVING_MPS]
     if not fast.size:
-        return np.zeros(0), np.zeros(0)
+        return np.zeros(0), np.zeros(0), np.zeros(0)
     length_s = float(np.clip(_WINDOW_M / np.median(fast), _WINDOW_LEAST_S, _WINDOW_MOST_S))
     step_s = max(length_s / _WINDOWS_OVERLAP, (end_s - begin_s) / _WINDOWS_MOST)
     starts = gnss.instants(step_s, begin_s, end_s - length_s)
     distance_m = gnss.distance_m(starts, starts + length_s)
-    starts = starts[np.nan_to_num(distance_m) > max(_SLOW_SHARE * usual(distance_m, 0.9), MOVING_MPS * length_s)]
-    return starts, starts + length_s
+    moves = np.nan_to_num(distance_m) > max(_SLOW_SHARE * usual(distance_m, 0.9), MOVING_MPS * length_s)
+    return starts[moves], starts[moves] + length_s, distance_m[moves]
 
 
 def clock_lag(gnss: Places, other: Record) -> tuple[float, str]:

@@ -88,9 +88,9 @@ class Places(Record):
         """Distance run from some instants to others [m]: the chord, and by half of it what a curve adds; NaN where
         unknown.
         """
-        middle_s = (begin_s + end_s) / 2
-        parts = (begin_s, end_s), (begin_s, middle_s), (middle_s, end_s)
-        chord, first, second = (np.linalg.norm(self.gained(*part), axis=1) for part in parts)
+        instants = begin_s, (begin_s + end_s) / 2, end_s
+        begin, middle, end = (np.where(self.known(t_s)[:, None], self.at(t_s), np.nan) for t_s in instants)
+        chord, first, second = (np.linalg.norm(moved, axis=1) for moved in (end - begin, middle - begin, end - middle))
         return np.asarray(first + second + (first + second - chord) / 3.0)
 
 

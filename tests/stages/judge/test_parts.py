@@ -56,14 +56,7 @@ from pipeline.stages.judge.hazards import (
     hazard_size_m,
     instant_columns,
 )
-from pipeline.stages.judge.judge import (
-    TrueCrossing,
-    _is_interpolated,
-    _take_true_times,
-    failure_columns,
-    true_crossings,
-    with_instants_between,
-)
+from pipeline.stages.judge.judge import _is_interpolated, _take_true_times, failure_columns
 from pipeline.stages.judge.judged import RIGHT, UNKNOWN, WRONG, Judgements
 from pipeline.stages.judge.judgement import (
     JudgeInput,
@@ -73,6 +66,7 @@ from pipeline.stages.judge.judgement import (
     judge_by_own_anchors,
     judge_positions,
 )
+from pipeline.stages.judge.train_crossings import TrueCrossing, true_crossings, with_instants_between
 from pipeline.stages.track.path import Place, RoutePath
 from schemas.config import Configuration, HazardConfig, LdsConfig, Vehicle
 from schemas.enums import Evidence, Hazard, Judgement, LdsState, PassageStatus, Suspect, Verdict
