@@ -137,10 +137,11 @@ def odometer_at(at_ns: Ints, aligned: AlignedEpochs, odometry: Odometry) -> Floa
     anchor_s = odometry.seconds(aligned.t_ns[anchors]) - aligned.latency_s[anchors]
     at_s = odometry.seconds(at_ns)
     near = (np.searchsorted(anchor_s, at_s, side="right") - 1).clip(0)
-    moved_m = odometry.distance_at_s(at_s) - odometry.distance_at_s(anchor_s[near])
-    whole = odometry.doubt_at_s(at_s) == odometry.doubt_at_s(anchor_s[near])
+    at, anchor = odometry.read(at_s), odometry.read(anchor_s[near])
+    moved_m = at.distance_m - anchor.distance_m
+    whole = at.doubt_m == anchor.doubt_m
     distance = aligned.odometer_m[anchors[near]] + aligned.odometer_scale[anchors[near]] * moved_m
-    return np.where(odometry.known_at_s(at_s) & whole, distance, np.nan)
+    return np.where(at.known & whole, distance, np.nan)
 
 
 def _with_odometer(
@@ -155,21 +156,22 @@ def _with_odometer(
     """Columns of the odometer, read at each epoch less the latency in use there."""
     t_ns = positions.t_ns
     at = odometry.seconds(t_ns) - in_use.latency_s
-    known = odometry.known_at_s(at)
+    read = odometry.read(at)
+    known = read.known
     rows = np.flatnonzero(known)
     step, driven = np.zeros((2, known.size))
     step[rows] = odometry.increments(t_ns[rows], in_use.scale[rows], in_use.latency_s[rows]).distance_m
     driven[rows] = odometry.driven(t_ns[rows], in_use.scale[rows], in_use.latency_s[rows])
     total, travelled = (np.where(known, np.cumsum(steps), np.nan) for steps in (step, driven))
-    speed = np.where(known, in_use.scale * odometry.speed_at_s(at), np.nan)
-    noise = odometry.noise_at_s(at)
-    width_m = odometry.hysteresis_m(at)
+    speed = np.where(known, in_use.scale * read.speed_mps, np.nan)
+    width_m = read.hysteresis_m
     held = with_hysteresis(total, width_m)
     turning = np.where(width_m > 0.0, speed_of_positions(at, held, config.align.speed_window_s), speed)
     turning[at < odometry.t_s[0] + config.align.speed_window_s] = np.nan
-    inside = (at >= odometry.t_s[0]) & (at <= odometry.t_s[-1])
     reason = first_reason(
-        (~known & inside, NotEvaluated.INTERRUPTED), (~known, BEYOND_SPAN), (~noise.shown, NotEvaluated.NOISE_UNKNOWN)
+        (~known & read.inside, NotEvaluated.INTERRUPTED),
+        (~known, BEYOND_SPAN),
+        (~read.noise_shown, NotEvaluated.NOISE_UNKNOWN),
     )
     return AlignedEpochs(
         **positions.columns(),
@@ -182,11 +184,11 @@ def _with_odometer(
         odometer_m=total,
         travelled_m=travelled,
         odometer_reason=reason,
-        odometer_slips=odometry.slips_at_s(at) & inside,
-        odometer_doubt_m=odometry.doubt_at_s(at),
-        odometer_white_m2_per_s=odometry.white_m2_per_s_at(at),
-        odometer_rows_m=np.minimum(odometry.known_row_sigma_m(at), config.scatter_limit_m),
-        odometer_period_s=noise.period_s,
+        odometer_slips=read.slips & read.inside,
+        odometer_doubt_m=read.doubt_m,
+        odometer_white_m2_per_s=read.white_m2_per_s,
+        odometer_rows_m=np.minimum(read.row_sigma_m, config.scatter_limit_m),
+        odometer_period_s=read.period_s,
         stamp_jitter_s=jitter_s,
         speed_mps=speed,
         direction=_direction(turning, config.matching.deadband_mps),
