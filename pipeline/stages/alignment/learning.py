@@ -97,6 +97,7 @@ class _Learner:
     ) -> None:
         self._config = config
         self._odometry = odometry
+        self._scatters = odometry.known_noise.scatters
         self._vehicle = vehicle
         self._learned = learned
         self._filter = ScaleLatencyFilter(*error_model(config.monitors), odometry, config.align)
@@ -253,7 +254,7 @@ class _Learner:
             scale_sigma=in_use.scale_sigma,
             latency_sigma_s=in_use.latency_sigma_s,
             white_m2_per_s=read.white_m2_per_s,
-            rows_m=np.minimum(read.row_sigma_m, self._config.scatter_limit_m),
+            rows_m=np.minimum(read.row_sigma_m, self._config.scatter_limit_m) if self._scatters else None,
             period_s=read.period_s,
         )
         odometer = self._odometry.increments(self._t_ns[part], in_use.scale, in_use.latency_s, read)

@@ -95,7 +95,7 @@ def _along(epochs: AlignedEpochs, t_s: Floats, reasons: Ints, config: Configurat
         scale_sigma=epochs.scale_sigma[rows],
         latency_sigma_s=epochs.latency_sigma_s[rows],
         white_m2_per_s=epochs.odometer_white_m2_per_s[rows],
-        rows_m=epochs.odometer_rows_m[rows],
+        rows_m=epochs.odometer_rows_m[rows] if epochs.odometer_rows_m.any() else None,
         period_s=epochs.odometer_period_s[rows],
     )
     return along_series(at_rows, Increments(_steps(epochs.odometer_m[rows]), _steps(epochs.speed_mps[rows])), config)

@@ -68,15 +68,22 @@ class NoiseMeter:
     def variance_m2(self, begin: int, end: int) -> Floats:
         """M of the rows [begin, end) by monitor: raw, then the EWMAs; NaN where not known yet."""
         if self._given_m2 is not None:
-            return np.tile(self._given_m2, (end - begin, 1))
+            return np.tile(self._given_m2[:, None], (1, end - begin)).T
         if not self._samples or begin == end:
             return np.full((end - begin, self._memories_s.size), np.nan)
         renewals = np.arange(self._renewal[begin], self._renewal[end - 1] + 1)
-        # A monitor takes the noise of the lag nearest to its memory; after a pause, that of a lag as long as the pause.
-        needed_s = np.maximum(self._memories_s, self._series.dt_s[begin:end, None])
-        columns = np.searchsorted(1.5 * np.array(self._lags_s[:-1]), needed_s)
         by_lag = self._by_lag(renewals)
-        return np.asarray(np.take_along_axis(by_lag[self._renewal[begin:end] - renewals[0]], columns, axis=1))
+        of_row = self._renewal[begin:end] - renewals[0]
+        # A monitor takes the noise of the lag nearest to its memory; after a pause, that of a lag as long as the pause.
+        bounds_s = 1.5 * np.array(self._lags_s[:-1])
+        nearest = np.searchsorted(bounds_s, self._memories_s)
+        at_least = np.searchsorted(bounds_s, self._series.dt_s[begin:end])
+        columns = (by_lag[:, lag][of_row] for lag in nearest)
+        noise_m2 = np.vstack(list(columns)).T
+        after_pause = np.flatnonzero(at_least)
+        lags = np.maximum(nearest, at_least[after_pause, None])
+        noise_m2[after_pause] = by_lag[of_row[after_pause, None], lags]
+        return np.asarray(noise_m2)
 
     def stated_excess_m2(self) -> Floats:
         """What the lags of 10 and 100 s that are ready show beyond the stated sigma, row by row [m^2], causally.
@@ -174,19 +181,35 @@ class _SecondDifferences:
     def looked_back(self, entering: Ints, ends: Ints) -> tuple[Floats, Floats, Floats]:
         """M of the counted samples in a window before each of `ends`, its relative error, the stated variance.
 
-        M is the largest over the quantiles; a window still short is filled with -inf, which sorts first.
+        M is the largest over the quantiles.
         """
         begins = np.maximum(ends - self.window, 0)
         count = np.maximum(ends - begins, 1)
-        nothing = np.full((len(self.quantiles), self.window), -np.inf)
-        windows = sliding_window_view(np.hstack([nothing, self.noise_m2[:, entering]]), self.window, axis=1)
-        ordered = np.sort(windows[:, ends])
-        # Windows are `window` wide, so the sample of a quantile stands behind the filling.
-        rank = self.window - count + np.ceil(np.array(self.quantiles)[:, None] * count).astype(np.int64) - 1
-        shown_m2 = np.take_along_axis(ordered, rank[..., None], axis=2).max(axis=(0, 2))
-        total_m2 = np.concatenate([[0.0], np.cumsum(self.stated_m2[entering])])
+        rank = np.ceil(np.array(self.quantiles)[:, None] * count).astype(np.int64) - 1
+        short = ends < self.window
+        shown_m2 = np.zeros(ends.size)
+        if short.any():
+            shown_m2[short] = self._of_short_windows(entering[: self.window], ends[short], count[short], rank[:, short])
+        if not short.all():
+            shown_m2[~short] = self._of_whole_windows(entering, begins[~short], rank[:, ~short][:, 0])
+        total_m2 = np.concatenate([[0.0], np.cumsum(self.stated_m2[entering[: int(ends.max())]])])
         pieces = np.maximum(count / self.span, 1.0)
         return np.maximum(shown_m2, 0.0), np.sqrt(2.0 / pieces), (total_m2[ends] - total_m2[begins]) / count
+
+    def _of_whole_windows(self, entering: Ints, begins: Ints, ranks: Ints) -> Floats:
+        """The largest over the quantiles, by their rank, of the windows that begin at these samples [m^2]."""
+        first = int(begins.min())
+        samples_m2 = self.noise_m2[:, entering[first : int(begins.max()) + self.window]]
+        windows = sliding_window_view(samples_m2, self.window, axis=1)[:, begins - first]
+        by_quantile = zip(windows, ranks.tolist(), strict=True)
+        return np.asarray(np.max([np.partition(of, rank, axis=1)[:, rank] for of, rank in by_quantile], axis=0))
+
+    def _of_short_windows(self, entering: Ints, ends: Ints, count: Ints, rank: Ints) -> Floats:
+        """The same of windows that begin at the first sample: filled in front with -inf, which sorts first."""
+        nothing = np.full((len(self.quantiles), self.window), -np.inf)
+        windows = sliding_window_view(np.hstack([nothing, self.noise_m2[:, entering]]), self.window, axis=1)
+        rank = (self.window - count + rank)[..., None]
+        return np.asarray(np.take_along_axis(np.sort(windows[:, ends]), rank, axis=2).max(axis=(0, 2)))
 
 
 class _Triples(NamedTuple):
