@@ -24,7 +24,7 @@ from pipeline.stages.epochs.verdicts import (
 from pipeline.stages.monitors.axes import Axis, axes_of
 from pipeline.stages.monitors.axis import BLOCK, FIRST_BLOCK, AxisSeries, AxisState, run_axis
 from pipeline.stages.monitors.noise import OF_WALK, OF_WHITE_NOISE, NoiseMeter
-from schemas.arrays import Bools, Floats, Ints
+from schemas.arrays import Bools, Floats, Ints, rows_of
 from schemas.config import Configuration
 from schemas.enums import NotEvaluated
 from schemas.stages import AlignedEpochs
@@ -89,7 +89,7 @@ class AxisBank:
 
     def _store(self, part: AxisSeries, value: Floats, threshold: Floats, noise_m: Floats) -> None:
         """Write what was evaluated of some rows into the arrays by epoch."""
-        present = ~part.fresh[:, None] & self.enabled[None, :]
+        present = (self.enabled[:, None] & ~part.fresh).T
         # One noise too large, and the axis has a blind spot: none of its monitors says that all is well.
         known: Bools = np.all((noise_m <= self._config.noise_limit_m) | ~self.enabled.any(), axis=1)
         judged = present & known[:, None]
@@ -97,12 +97,13 @@ class AxisBank:
         if self._blind is not None:
             state[state == PASS] = NOT_EVALUATED
             judged &= state == FAIL
-        self.state[part.epoch] = state
-        self.value[part.epoch] = np.where(present, value, np.nan)
-        self.threshold[part.epoch] = np.where(judged, threshold, np.nan)
-        self.noise_m[part.epoch] = noise_m
-        self.begins[part.epoch] = part.fresh
-        self.noise_known[part.epoch] = known
+        epochs = rows_of(part.epoch)
+        self.state[epochs] = state
+        self.value[epochs] = np.where(present, value, np.nan)
+        self.threshold[epochs] = np.where(judged, threshold, np.nan)
+        self.noise_m[epochs] = noise_m
+        self.begins[epochs] = part.fresh
+        self.noise_known[epochs] = known
 
     def freeze(self, epoch: int) -> None:
         """No row from this epoch on enters the noise, until a restart; evaluated anew from the last block on.
@@ -135,7 +136,8 @@ class AxisBank:
     def verdicts(self) -> dict[str, Verdicts]:
         """Verdicts of the monitors of this axis by name, as far as they are evaluated."""
         unknown = np.zeros(self.value.shape[0], dtype=np.bool_)
-        unknown[self.series.epoch] = np.isnan(self.noise_m[self.series.epoch]).any(axis=1)
+        epochs = rows_of(self.series.epoch)
+        unknown[epochs] = np.isnan(self.noise_m[epochs]).any(axis=1)
         too_large: Bools = np.any(self.noise_m > self._config.noise_limit_m, axis=1)
         of_noise = first_reason((unknown, NOISE_UNKNOWN), (too_large, NOISE_TOO_LARGE))
         reasons = otherwise(self.axis.reasons, of_noise)

@@ -10,7 +10,7 @@ import numpy as np
 import polars as pl
 
 from pipeline.stages.odometry.bound import LEAST_DOUBT_M, LOST_M, Bound, is_lost
-from pipeline.stages.odometry.driven import evenly_driven, moving_steps, travelled_m
+from pipeline.stages.odometry.driven import driven_or_left_m, evenly_driven, moving_steps, travelled_m
 from pipeline.stages.odometry.quantisation import KnownNoise, Noise, noise_of_rows, row_periods_s
 from pipeline.stages.odometry.reading import OdometerReading
 from pipeline.stages.odometry.rows import (
@@ -282,16 +282,24 @@ class Odometry:
     def _moving_s(self) -> tuple[Floats, Floats]:
         """Times, and for how long the train has moved up to each [s]."""
         at_s = self.t_s
-        at_m = self.distance_m
-        if self.noise.quantisation:
-            at_s, at_m = evenly_driven(at_s, at_m, self.row_sigma_m(at_s), self.deadband_mps, self.config)
+        if not self.noise.quantisation:
+            return at_s, _sums(np.where(self._moving_by_rows, np.diff(at_s), 0.0))
+        row_sigma_m = self.row_sigma_m(at_s)
+        at_s, at_m = evenly_driven(at_s, self.distance_m, row_sigma_m, self.deadband_mps, self.config)
         moving = moving_steps(at_s, at_m, self.deadband_mps, self.config.speed_window_s)
         return at_s, _sums(np.where(moving, np.diff(at_s), 0.0))
+
+    @cached_property
+    def _moving_by_rows(self) -> Bools:
+        """Whether the train moves in each step, by the distance as it is."""
+        return moving_steps(self.t_s, self.distance_m, self.deadband_mps, self.config.speed_window_s)
 
     @cached_property
     def _travelled_m(self) -> Floats:
         """Distance travelled at each row, whichever way the train went [m]."""
         width_m = self.read(self.t_s).hysteresis_m
+        if not width_m.any():
+            return np.asarray(np.maximum.accumulate(driven_or_left_m(self.distance_m, self._moving_by_rows)))
         return travelled_m(self.t_s, self.distance_m, width_m, self.deadband_mps, self.config.speed_window_s)
 
 

@@ -294,8 +294,12 @@ class KnownNoise:
 
 def row_periods_s(t_ns: Ints) -> Floats:
     """The period of the rows as known before each; of the first step nothing is known but that step."""
+    steps_ns = np.diff(t_ns)
+    first_s = steps_ns[0] / NS_PER_S
+    if (steps_ns == steps_ns[0]).all():
+        return np.full(t_ns.size, first_s)
     period_s = periods_before_s(t_ns)
-    period_s[:2] = (t_ns[1] - t_ns[0]) / NS_PER_S
+    period_s[:2] = first_s
     return period_s
 
 

@@ -330,7 +330,10 @@ def filled_in(
 
 def slips_of(stream: pl.DataFrame, config: AlignConfig) -> Bools:
     """Whether a row is slip, by its flag or by a sigma of the speed beyond any use."""
-    slips: Bools = truths(stream["slip"]) | (floats(stream, "sigma_speed_mps") > config.slip_sigma_mps)
+    declared = stream["sigma_speed_mps"]
+    slips = truths(stream["slip"])
+    if declared.null_count() < declared.len():
+        slips |= floats(stream, "sigma_speed_mps") > config.slip_sigma_mps
     return slips
 
 
@@ -341,4 +344,6 @@ _DECLARED_ROWS = 100
 def declared_mps(stream: pl.DataFrame) -> Floats:
     """The usual sigma of the speed as declared up to each row [m/s]; NaN where none is."""
     declared = stream["sigma_speed_mps"].cast(pl.Float64)
+    if declared.null_count() == declared.len():
+        return np.full(declared.len(), np.nan)
     return declared.rolling_median(_DECLARED_ROWS, min_samples=1).to_numpy()
