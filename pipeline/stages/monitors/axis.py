@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import fields
 
 import numpy as np
@@ -28,13 +28,22 @@ def _solved(decay: Floats, y: Floats, initial: Floats) -> Floats:
     if not len(y):
         return y
     y[0] += decay[0] * initial
-    band = np.ones((2, len(y)), order="F")
+    band = _band(len(y))
     for channel in range(y.shape[1]):
-        if not decay[1:, channel].any():
-            continue  # without memory the drive is all there is
-        np.negative(decay[1:, channel], out=band[1, :-1])
-        y[:, channel : channel + 1], _ = dtbtrs(band, y[:, channel : channel + 1], uplo="L", diag="U", overwrite_b=1)
+        y[:, channel] = _solved_column(band, decay[:, channel], y[:, channel])
     return y
+
+
+def _band(rows: int) -> Floats:
+    """The two diagonals of the system: ones, and room for the decays."""
+    return np.ones((2, rows), order="F")
+
+
+def _solved_column(band: Floats, decay: Floats, y: Floats) -> Floats:
+    """One column `y`, overwritten, which begins with what was carried on."""
+    np.negative(decay[1:], out=band[1, :-1])
+    solved, _ = dtbtrs(band, y[:, None], uplo="L", diag="U", overwrite_b=1)
+    return np.asarray(solved[:, 0])
 
 
 def ewma_weight(alpha: Floats, dt_s: Floats) -> Floats:
@@ -87,19 +96,28 @@ def variance_of_ewma(
 
     c <- b phi r c + alpha g s_k (s_k - phi s_p)
     """
-    carried, fresh_m2, change = _memory(sigma_m, sigma_before_m, decorrelation)
-    coupling = np.empty_like(gain)
+    coupling = np.zeros_like(gain)
     covariances = np.empty_like(state.covariance)
-    for index, before in enumerate(state.covariance):
-        drive = np.asfortranarray(gain[:, index, None] * fresh_m2)
-        covariance = _solved(keep[:, index, None] * carried, drive, before)
-        coupling[1:, index] = (covariance[:-1] * change[1:]).sum(axis=1)
-        coupling[:1, index] = (before * change[:1]).sum(axis=1)
-        covariances[index] = covariance[-1]
+    new_m2 = np.zeros(len(gain))
+    band = _band(len(gain))
+    # Column by column, which the cache holds.
+    for source, column in enumerate(_by_source(sigma_m, sigma_before_m, decorrelation)):
+        carried, fresh_m2, change = _memory(*column)
+        has_memory = carried[1:].any()
+        for average, before in enumerate(state.covariance[:, source].tolist()):
+            covariance = gain[:, average] * fresh_m2
+            covariance[0] += keep[0, average] * carried[0] * before
+            if has_memory:  # else the drive is all there is
+                covariance = _solved_column(band, keep[:, average] * carried, covariance)
+            coupling[0, average] += before * change[0]
+            coupling[1:, average] += covariance[:-1] * change[1:]
+            covariances[average, source] = covariance[-1]
+        sigma, _, lost = column
+        new_m2 += sigma**2 * lost * (2.0 - lost)
     fresh = gain**2 * increment_m2[:, None] + 2.0 * gain * keep * coupling
     variance = linear_recurrence(keep**2, fresh, state.variance)
     # A sigma that falls quickly, though not by the step, can bring the printed recursion below what is new in it.
-    new_m2 = (sigma_m**2 * decorrelation * (2.0 - decorrelation)).sum(axis=1) + white_m2
+    new_m2 += white_m2
     return np.maximum(variance, gain**2 * new_m2[:, None]), (variance[-1], covariances)
 
 
@@ -122,13 +140,22 @@ def noise_of_ewma(
     return np.maximum(variance, gain * covariance), (variance[-1], covariance[-1])
 
 
+def _by_source(
+    sigma_m: Floats, sigma_before_m: Floats, decorrelation: Floats
+) -> Iterator[tuple[Floats, Floats, Floats]]:
+    """The columns of each source."""
+    sigmas = list(sigma_m.T)
+    before = sigmas if sigma_before_m is sigma_m else list(sigma_before_m.T)
+    return zip(sigmas, before, decorrelation.T, strict=True)
+
+
 def _same(sigma_m: Floats, sigma_before_m: Floats) -> bool:
     """No sigma changed by the step."""
     return sigma_m is sigma_before_m or np.array_equal(sigma_m, sigma_before_m)
 
 
 def _memory(sigma_m: Floats, sigma_before_m: Floats, decorrelation: Floats) -> tuple[Floats, Floats, Floats]:
-    """Terms of the recursion: phi r, s_k (s_k - phi s_p) and phi r - 1; shapes (n, sources)."""
+    """Terms of the recursion of one source: phi r, s_k (s_k - phi s_p) and phi r - 1; shapes (n,)."""
     if _same(sigma_m, sigma_before_m):
         return 1.0 - decorrelation, sigma_m * (decorrelation * sigma_m), -decorrelation
     ratio = np.divide(sigma_m, sigma_before_m, out=np.ones_like(sigma_m), where=sigma_before_m > 0.0)
@@ -158,10 +185,11 @@ def before_steps(sigma_m: Floats, decorrelation: Floats, factor: float) -> Float
 
 def increment_variance(sigma_m: Floats, sigma_before_m: Floats, decorrelation: Floats) -> Floats:
     """Variance of the increments by all sources together [m^2], shape (n,); 2 R (1-phi) where R stays."""
-    correlated = 2.0 * decorrelation * sigma_m * sigma_before_m
-    if _same(sigma_m, sigma_before_m):
-        return np.asarray(correlated.sum(axis=1))
-    return np.asarray(((sigma_m - sigma_before_m) ** 2 + correlated).sum(axis=1))
+    variance_m2 = np.zeros(len(sigma_m))
+    for sigma, before, lost in _by_source(sigma_m, sigma_before_m, decorrelation):
+        correlated = 2.0 * lost * sigma * before
+        variance_m2 += correlated if _same(sigma, before) else (sigma - before) ** 2 + correlated
+    return variance_m2
 
 
 # Rows evaluated at once: few after a restart, which may soon be followed by another; never more than the cache holds.

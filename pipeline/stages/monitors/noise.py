@@ -201,8 +201,11 @@ class _SecondDifferences:
         first = int(begins.min())
         samples_m2 = self.noise_m2[:, entering[first : int(begins.max()) + self.window]]
         windows = sliding_window_view(samples_m2, self.window, axis=1)[:, begins - first]
-        by_quantile = zip(windows, ranks.tolist(), strict=True)
-        return np.asarray(np.max([np.partition(of, rank, axis=1)[:, rank] for of, rank in by_quantile], axis=0))
+        largest_m2 = np.full(begins.size, -np.inf)
+        for of_quantile, rank in zip(windows, ranks.tolist(), strict=True):
+            of_quantile.partition(rank, axis=1)
+            np.maximum(largest_m2, of_quantile[:, rank], out=largest_m2)
+        return largest_m2
 
     def _of_short_windows(self, entering: Ints, ends: Ints, count: Ints, rank: Ints) -> Floats:
         """The same of windows that begin at the first sample: filled in front with -inf, which sorts first."""
@@ -235,6 +238,8 @@ class _Sampler:
         self._series = series
         self._config = config
         self._t_s = np.cumsum(series.dt_s) - series.dt_s[:1]
+        self._between_s = 0.5 * (self._t_s[1:] + self._t_s[:-1])
+        self._firsts: dict[float, Ints] = {}
         self.renewal: Ints = (self._t_s // config.noise_renewal_s).astype(np.int64)
         # Only of the time before the noise is first known: later rows must not change the lags (causal).
         steps_s = series.dt_s[1:]
@@ -280,13 +285,19 @@ class _Sampler:
         """The first row t in every `spacing_s`, and the rows nearest to t - L and t - 2 L, if near enough."""
         t_s = self._t_s
         reach_s = max(0.1 * lag_s, 0.5 * self.period_s)
-        cell = np.floor(t_s / spacing_s + 1e-6)
-        last = np.flatnonzero(np.diff(cell, prepend=cell[:1] - 1.0) > 0.0)
-        between_s = 0.5 * (t_s[1:] + t_s[:-1])
-        middle, oldest = (np.searchsorted(between_s, t_s[last] - lags * lag_s) for lags in (1, 2))
-        near = (np.abs(t_s[last] - lag_s - t_s[middle]) <= reach_s) & (middle < last)
-        near &= (np.abs(t_s[last] - 2.0 * lag_s - t_s[oldest]) <= reach_s) & (oldest < middle)
+        last = self._firsts_in(spacing_s)
+        last_s = t_s[last]
+        middle, oldest = (np.searchsorted(self._between_s, last_s - lags * lag_s) for lags in (1, 2))
+        near = (np.abs(last_s - lag_s - t_s[middle]) <= reach_s) & (middle < last)
+        near &= (np.abs(last_s - 2.0 * lag_s - t_s[oldest]) <= reach_s) & (oldest < middle)
         return _Triples(last, middle, oldest).where(near)
+
+    def _firsts_in(self, spacing_s: float) -> Ints:
+        """The first row in every `spacing_s`; most lags have the same spacing."""
+        if spacing_s not in self._firsts:
+            cell = np.floor(self._t_s / spacing_s + 1e-6)
+            self._firsts[spacing_s] = np.flatnonzero(np.diff(cell, prepend=cell[:1] - 1.0) > 0.0)
+        return self._firsts[spacing_s]
 
     def _model_m2(self, lag_s: float, rows: _Triples) -> Floats:
         """Variance of the second differences by the whole model, sample by sample [m^2].
