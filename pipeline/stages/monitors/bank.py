@@ -23,7 +23,7 @@ from pipeline.stages.epochs.verdicts import (
 )
 from pipeline.stages.monitors.axes import Axis, axes_of
 from pipeline.stages.monitors.axis import BLOCK, FIRST_BLOCK, AxisSeries, AxisState, run_axis
-from pipeline.stages.monitors.noise import OF_WALK, OF_WHITE_NOISE, NoiseMeter
+from pipeline.stages.monitors.noise import OF_WALK, OF_WHITE_NOISE
 from schemas.arrays import Bools, Floats, Ints, rows_of
 from schemas.config import Configuration
 from schemas.enums import NotEvaluated
@@ -64,7 +64,7 @@ class AxisBank:
         # Rows of the odometer scatter by nobody knows how much yet.
         self.noise_known: Bools = axis.reasons != NUMBER[NOISE_UNKNOWN]
         given_m: tuple[float, ...] | None = getattr(config.monitors, f"noise_{axis.name}_m")
-        self._meter = NoiseMeter(axis.series, axis.moving, given_m, config)
+        self._meter = axis.noise_meter(given_m)
         self._begin_at(0, None, BLOCK)
 
     def _begin_at(self, row: int, state: AxisState | None, block: int) -> None:
@@ -168,6 +168,7 @@ class MonitorBank:
         config: the configuration.
         blind_along: why those along the track cannot say that all is well, None where they can: an odometer made of the
             positions agrees with them whatever they say (DOMAIN section 5.0).
+        along_axis: the axis along the track, where the alignment made it already.
 
     Source:
         DIAG eq. 1-17; DOMAIN section 3.
@@ -179,12 +180,13 @@ class MonitorBank:
         single: Mapping[str, Verdicts],
         config: Configuration,
         blind_along: NotEvaluated | None = None,
+        along_axis: Axis | None = None,
     ):
         self._count = epochs.height
         disabled = config.monitors.disabled
         self._axes = tuple(
             AxisBank(axis, self._count, config, blind_along if axis.name == "along" else None)
-            for axis in axes_of(epochs, config)
+            for axis in axes_of(epochs, config, along_axis)
         )
         along, across, _ = self._axes
         # In a run without an odometer the axis across the track has to say where the bank begins.

@@ -26,14 +26,23 @@ OF_WHITE_NOISE = 6.0
 class NoiseMeter:
     """Fast noise of one axis, row by row of its series; rows under alarm never enter."""
 
-    def __init__(self, series: AxisSeries, moving: Bools, given_m: tuple[float, ...] | None, config: Configuration):
-        """`series`: of the whole run; `given_m`: by monitor, replaces what is measured."""
+    def __init__(
+        self,
+        series: AxisSeries,
+        moving: Bools,
+        given_m: tuple[float, ...] | None,
+        config: Configuration,
+        sampler: Sampler | None = None,
+    ):
+        """`series`: of the whole run; `given_m`: by monitor, replaces what is measured; `sampler`: of the series, where
+        another meter made one.
+        """
         self._series = series
         self._config = config.monitors
         self._limit_m2 = config.noise_limit_m**2
         self._given_m2 = None if given_m is None else np.square(np.array(given_m))
         self._memories_s = np.array([0.0, *(1.0 / alpha for alpha in self._config.ewma_alphas)])
-        sampler = _Sampler(series, moving, self._config)
+        sampler = sampler or Sampler(series, moving, self._config)
         self._renewal = sampler.renewal
         self._lags_s: list[float] = []
         self._samples: list[_SecondDifferences] = []
@@ -231,8 +240,10 @@ class _Triples(NamedTuple):
         return np.asarray(values[self.last] - 2.0 * values[self.middle] + values[self.oldest])
 
 
-class _Sampler:
-    """Second differences by running sums, whose differences are what happened between two rows."""
+class Sampler:
+    """Second differences by running sums, whose differences are what happened between two rows; those of a lag are made
+    once.
+    """
 
     def __init__(self, series: AxisSeries, moving: Bools, config: MonitorConfig) -> None:
         self._series = series
@@ -240,6 +251,7 @@ class _Sampler:
         self._t_s = np.cumsum(series.dt_s) - series.dt_s[:1]
         self._between_s = 0.5 * (self._t_s[1:] + self._t_s[:-1])
         self._firsts: dict[float, Ints] = {}
+        self._over: dict[float, _SecondDifferences] = {}
         self.renewal: Ints = (self._t_s // config.noise_renewal_s).astype(np.int64)
         # Only of the time before the noise is first known: later rows must not change the lags (causal).
         steps_s = series.dt_s[1:]
@@ -258,6 +270,12 @@ class _Sampler:
         self._lasting_m = [np.cumsum(rate_mps * series.dt_s) for rate_mps in series.lasting_mps.T if rate_mps.any()]
 
     def over(self, lag_s: float) -> _SecondDifferences:
+        """The second differences over a lag."""
+        if lag_s not in self._over:
+            self._over[lag_s] = self._sampled(lag_s)
+        return self._over[lag_s]
+
+    def _sampled(self, lag_s: float) -> _SecondDifferences:
         """M = (second difference^2 / quantile of chi^2 - model) / 4 (DOMAIN section 3)."""
         config = self._config
         spacing_s = max(self.period_s, 0.1 * lag_s, config.noise_spacing_s)
