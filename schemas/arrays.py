@@ -102,6 +102,20 @@ def median(values: Floats | Ints) -> float:
     return float(ordered[half] if flat.size % 2 else 0.5 * (ordered[half - 1] + ordered[half]))
 
 
+def rows_of(numbers: Ints) -> Rows:
+    """Rows by growing numbers: a slice where they follow each other, which numpy takes several times faster.
+
+    Args:
+        numbers: of rows, growing, shape (n,).
+
+    Returns:
+        The same rows.
+    """
+    if numbers.size and numbers[-1] - numbers[0] + 1 == numbers.size:
+        return slice(int(numbers[0]), int(numbers[-1]) + 1)
+    return numbers
+
+
 def runs_of(mask: Bools) -> tuple[Ints, Ints]:
     """First and last index of every run of true values.
 

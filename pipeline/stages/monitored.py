@@ -11,7 +11,7 @@ from dataclasses import replace
 import numpy as np
 import polars as pl
 
-from pipeline.stages.alignment.align import align, odometer_at
+from pipeline.stages.alignment.align import alignment, odometer_at
 from pipeline.stages.epochs.verdicts import MonitoredEpochs, Verdicts
 from pipeline.stages.evidence import TrainEvidence
 from pipeline.stages.judge.epochs import direction_by_evidence
@@ -79,7 +79,7 @@ def monitor_solution(
     config = prepared.config
     matched = matches[solution]
     odometry = None if prepared.odometry is None else prepared.odometry.oriented(matched.odometer_sign)
-    aligned = align(matched.epochs, odometry, prepared.vehicle, config)
+    aligned, along = alignment(matched.epochs, odometry, prepared.vehicle, config)
     if odometry is None:
         # A balise valid in one direction means that of the train, not of one step of the positions (DOMAIN section 4).
         direction = direction_by_evidence(aligned, matched.path, evidence, prepared.vehicle, config)
@@ -88,7 +88,7 @@ def monitor_solution(
     # What is made of the positions cannot say that they are right (DOMAIN section 5.0).
     blind_along = NotEvaluated.ODOMETER_OF_GNSS if odometry is not None and odometry.of_gnss else None
     singles = _without_memory(prepared, solution, aligned, channel)
-    bank = MonitorBank(aligned, singles, config, blind_along)
+    bank = MonitorBank(aligned, singles, config, blind_along, along)
     balises = matched.path.balises_on_path(prepared.site.balises)
     reads = _reads_on_odometer(prepared.run.balise_reads, aligned, odometry)
     scale_sigma = None if odometry is None else odometry.scale_sigma

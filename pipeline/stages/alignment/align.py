@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
 
@@ -11,8 +12,7 @@ from pipeline.stages.alignment.learning import Hold, ToLearn, learn
 from pipeline.stages.alignment.odometer_filter import Estimates, stamp_jitter_s
 from pipeline.stages.epochs.clock import periods_before_s
 from pipeline.stages.epochs.verdicts import NO_ODOMETER, NUMBER, first_reason
-from pipeline.stages.monitors.axes import along_axis
-from pipeline.stages.monitors.noise import NoiseMeter
+from pipeline.stages.monitors.axes import Axis, along_axis
 from pipeline.stages.odometry.driven import with_hysteresis
 from pipeline.stages.odometry.odometry import Odometry
 from schemas.arrays import Floats, Ints
@@ -27,7 +27,7 @@ BEYOND_SPAN = NotEvaluated.BEYOND_SPAN
 def align(
     positions: MatchedEpochs, odometry: Odometry | None, vehicle: Vehicle, config: Configuration
 ) -> AlignedEpochs:
-    """Positions of one solution with the odometer at each, and what a test along the track has to allow for.
+    """The epochs of `alignment`, for whoever needs no more of it.
 
     Args:
         positions: matched epochs of one solution, arrays of shape (n,).
@@ -41,6 +41,33 @@ def align(
     Source:
         DOMAIN sections 3 and 4; DIAG eq. 1-3.
     """
+    return alignment(positions, odometry, vehicle, config).epochs
+
+
+class Alignment(NamedTuple):
+    """Aligned epochs, and the axis along the track if it was made for their confidence interval."""
+
+    epochs: AlignedEpochs
+    along: Axis | None = None
+
+
+def alignment(
+    positions: MatchedEpochs, odometry: Odometry | None, vehicle: Vehicle, config: Configuration
+) -> Alignment:
+    """Positions of one solution with the odometer at each, and what a test along the track has to allow for.
+
+    Args:
+        positions: matched epochs of one solution, arrays of shape (n,).
+        odometry: the odometer, growing with the path of the positions; None without one.
+        vehicle: scale and latency, as far as the file gives them.
+        config: the configuration; used are `align`, `monitors`, `lds` and `matching`.
+
+    Returns:
+        The aligned epochs, arrays of shape (n,), and what the bank may use again.
+
+    Source:
+        DOMAIN sections 3 and 4; DIAG eq. 1-3.
+    """
     most_m = config.scatter_limit_m
     positions = replace(
         positions,
@@ -50,7 +77,7 @@ def align(
     )
     allowed = _allowed(positions, config)
     if odometry is None:
-        return _without_odometer(positions, allowed, vehicle, config)
+        return Alignment(_without_odometer(positions, allowed, vehicle, config))
     # A position that has jumped aside is still compared: that is how the monitors see the jump.
     along_m = unrolled(positions)
     jitter_s = stamp_jitter_s(
@@ -60,25 +87,25 @@ def align(
     in_use, holds = learn(to_learn, odometry, vehicle, config)
     aligned = _with_odometer(positions, allowed, along_m, jitter_s, odometry, in_use, config)
     if not odometry.independent or config.lds.ci_source != "sigma":
-        return aligned
-    widened_m = np.sqrt(aligned.sigma_along_m**2 + stated_excess_m2(aligned, holds, config))
-    return replace(aligned, confidence_m=config.lds.ci_factor * widened_m)
+        return Alignment(aligned)
+    along = along_axis(aligned, config)
+    widened_m = np.sqrt(aligned.sigma_along_m**2 + stated_excess_m2(along, holds, aligned.height))
+    return Alignment(replace(aligned, confidence_m=config.lds.ci_factor * widened_m), along)
 
 
-def stated_excess_m2(aligned: AlignedEpochs, holds: Sequence[Hold], config: Configuration) -> Floats:
+def stated_excess_m2(axis: Axis, holds: Sequence[Hold], epochs: int) -> Floats:
     """Variance along the track beyond the stated one, as epochs before each show it (DOMAIN section 3).
 
     Measured in every run, whatever noise is given for the thresholds; nothing of a hold enters.
     """
-    axis = along_axis(aligned, config)
-    meter = NoiseMeter(axis.series, axis.moving, None, config)
+    meter = axis.noise_meter(None)
     for alarm, back in holds:
         meter.freeze(int(np.searchsorted(axis.series.epoch, alarm)))
-        if back < aligned.height:
+        if back < epochs:
             meter.restart(int(np.searchsorted(axis.series.epoch, back)))
-    known = np.searchsorted(axis.series.epoch, np.arange(aligned.height), side="right") - 1
+    known = np.searchsorted(axis.series.epoch, np.arange(epochs), side="right") - 1
     if not axis.series.epoch.size:
-        return np.zeros(aligned.height)
+        return np.zeros(epochs)
     return np.asarray(np.where(known < 0, 0.0, meter.stated_excess_m2()[known]))
 
 
@@ -137,10 +164,11 @@ def odometer_at(at_ns: Ints, aligned: AlignedEpochs, odometry: Odometry) -> Floa
     anchor_s = odometry.seconds(aligned.t_ns[anchors]) - aligned.latency_s[anchors]
     at_s = odometry.seconds(at_ns)
     near = (np.searchsorted(anchor_s, at_s, side="right") - 1).clip(0)
-    moved_m = odometry.distance_at_s(at_s) - odometry.distance_at_s(anchor_s[near])
-    whole = odometry.doubt_at_s(at_s) == odometry.doubt_at_s(anchor_s[near])
+    at, anchor = odometry.read(at_s), odometry.read(anchor_s[near])
+    moved_m = at.distance_m - anchor.distance_m
+    whole = at.doubt_m == anchor.doubt_m
     distance = aligned.odometer_m[anchors[near]] + aligned.odometer_scale[anchors[near]] * moved_m
-    return np.where(odometry.known_at_s(at_s) & whole, distance, np.nan)
+    return np.where(at.known & whole, distance, np.nan)
 
 
 def _with_odometer(
@@ -155,21 +183,22 @@ def _with_odometer(
     """Columns of the odometer, read at each epoch less the latency in use there."""
     t_ns = positions.t_ns
     at = odometry.seconds(t_ns) - in_use.latency_s
-    known = odometry.known_at_s(at)
+    read = odometry.read(at)
+    known = read.known
     rows = np.flatnonzero(known)
     step, driven = np.zeros((2, known.size))
     step[rows] = odometry.increments(t_ns[rows], in_use.scale[rows], in_use.latency_s[rows]).distance_m
     driven[rows] = odometry.driven(t_ns[rows], in_use.scale[rows], in_use.latency_s[rows])
     total, travelled = (np.where(known, np.cumsum(steps), np.nan) for steps in (step, driven))
-    speed = np.where(known, in_use.scale * odometry.speed_at_s(at), np.nan)
-    noise = odometry.noise_at_s(at)
-    width_m = odometry.hysteresis_m(at)
+    speed = np.where(known, in_use.scale * read.speed_mps, np.nan)
+    width_m = read.hysteresis_m
     held = with_hysteresis(total, width_m)
     turning = np.where(width_m > 0.0, speed_of_positions(at, held, config.align.speed_window_s), speed)
     turning[at < odometry.t_s[0] + config.align.speed_window_s] = np.nan
-    inside = (at >= odometry.t_s[0]) & (at <= odometry.t_s[-1])
     reason = first_reason(
-        (~known & inside, NotEvaluated.INTERRUPTED), (~known, BEYOND_SPAN), (~noise.shown, NotEvaluated.NOISE_UNKNOWN)
+        (~known & read.inside, NotEvaluated.INTERRUPTED),
+        (~known, BEYOND_SPAN),
+        (~read.noise_shown, NotEvaluated.NOISE_UNKNOWN),
     )
     return AlignedEpochs(
         **positions.columns(),
@@ -182,11 +211,11 @@ def _with_odometer(
         odometer_m=total,
         travelled_m=travelled,
         odometer_reason=reason,
-        odometer_slips=odometry.slips_at_s(at) & inside,
-        odometer_doubt_m=odometry.doubt_at_s(at),
-        odometer_white_m2_per_s=odometry.white_m2_per_s_at(at),
-        odometer_rows_m=np.minimum(odometry.known_row_sigma_m(at), config.scatter_limit_m),
-        odometer_period_s=noise.period_s,
+        odometer_slips=read.slips & read.inside,
+        odometer_doubt_m=read.doubt_m,
+        odometer_white_m2_per_s=read.white_m2_per_s,
+        odometer_rows_m=np.minimum(read.row_sigma_m, config.scatter_limit_m),
+        odometer_period_s=read.period_s,
         stamp_jitter_s=jitter_s,
         speed_mps=speed,
         direction=_direction(turning, config.matching.deadband_mps),

@@ -97,6 +97,7 @@ class _Learner:
     ) -> None:
         self._config = config
         self._odometry = odometry
+        self._scatters = odometry.known_noise.scatters
         self._vehicle = vehicle
         self._learned = learned
         self._filter = ScaleLatencyFilter(*error_model(config.monitors), odometry, config.align)
@@ -109,13 +110,13 @@ class _Learner:
         margin_ns = round(5e9 * config.align.latency_prior_sigma_s)
         t_ns = positions.t_ns
         usable = positions.usable
-        known = odometry.known_at(t_ns) & odometry.known_at(t_ns - margin_ns)
-        self._rows = np.flatnonzero(usable & known & odometry.noise_at_s(odometry.seconds(t_ns)).shown)
+        t_s = odometry.seconds(t_ns)
+        at = odometry.read(t_s)
+        self._rows = np.flatnonzero(usable & at.known & odometry.known_at(t_ns - margin_ns) & at.noise_shown)
         self._path_m = positions.along_m[self._rows]
         self._calibrated_m = positions.calibrated_m[self._rows]
         self._digits_m = positions.digits_m[self._rows]
         self._sigma_m = np.hypot(self._calibrated_m, self._digits_m)
-        t_s = odometry.seconds(t_ns)
         self._t_ns = t_ns[self._rows]
         self._t_s = t_s[self._rows]
         self._doubt_m = odometry.doubt_at_s(self._t_s)
@@ -241,22 +242,22 @@ class _Learner:
         """Increments of rows [begin, end); the one at `restart` has none before it."""
         part = slice(max(begin - 1, restart), end)
         in_use = self._learned.at(self._rows[part])
-        at_s = self._t_s[part] - in_use.latency_s
+        read = self._odometry.read(self._t_s[part] - in_use.latency_s)
         epochs = AlongEpochs(
             epoch=self._rows[part],
             t_s=self._t_s[part],
             along_m=self._path_m[part],
-            doubt_m=self._odometry.doubt_at_s(at_s),
+            doubt_m=read.doubt_m,
             sigma_m=self._calibrated_m[part],
             digits_m=self._digits_m[part],
             jitter_s=self._jitter_s[part],
             scale_sigma=in_use.scale_sigma,
             latency_sigma_s=in_use.latency_sigma_s,
-            white_m2_per_s=self._odometry.white_m2_per_s_at(at_s),
-            rows_m=np.minimum(self._odometry.known_row_sigma_m(at_s), self._config.scatter_limit_m),
-            period_s=self._odometry.noise_at_s(at_s).period_s,
+            white_m2_per_s=read.white_m2_per_s,
+            rows_m=np.minimum(read.row_sigma_m, self._config.scatter_limit_m) if self._scatters else None,
+            period_s=read.period_s,
         )
-        odometer = self._odometry.increments(self._t_ns[part], in_use.scale, in_use.latency_s)
+        odometer = self._odometry.increments(self._t_ns[part], in_use.scale, in_use.latency_s, read)
         return along_series(epochs, odometer, self._config).between(begin - part.start, end - part.start)
 
     def _hold(self, scale_sigma: float, alarm: int) -> tuple[int, float]:

@@ -85,7 +85,8 @@ class SignedOdometer:
         """Rows of the odometer for measuring its lag; a step of which anything is in doubt gives no distance."""
         odometer = self.odometer
         t_ns = odometer.epoch_ns + np.round(odometer.t_s * NS_PER_S).astype(np.int64)
-        doubtful = np.concatenate([[0.0], np.cumsum(np.isnan(self.undoubted_distance_m(t_ns[:-1], t_ns[1:])))])
+        whole = self._are_unbroken(t_ns[:-1], t_ns[1:]) & np.isfinite(odometer.steps_m(t_ns))
+        doubtful = np.concatenate([[0.0], np.cumsum(~whole)])
         noise_m = float(np.sqrt(odometer.noise.quantisation.still_m2))
         return CounterRows(odometer.t_s, (odometer.scale or 1.0) * odometer.distance_m, doubtful, noise_m)
 

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from functools import cached_property
 from typing import Literal
 
 import numpy as np
 
 from pipeline.stages.epochs.verdicts import NO_POSITION, NO_SIGMA, first_reason, otherwise
 from pipeline.stages.monitors.axis import AlongEpochs, AxisSeries, Source, along_series, errors_of, time_steps
+from pipeline.stages.monitors.noise import NoiseMeter, Sampler
 from pipeline.stages.odometry.driven import is_moving
 from pipeline.stages.odometry.odometry import Increments
 from schemas.arrays import Bools, Floats, Ints
@@ -29,6 +31,16 @@ class Axis:
     series: AxisSeries
     moving: Bools
     reasons: Ints
+    config: Configuration
+
+    @cached_property
+    def _sampler(self) -> Sampler:
+        """What all meters of its noise look at."""
+        return Sampler(self.series, self.moving, self.config.monitors)
+
+    def noise_meter(self, given_m: tuple[float, ...] | None) -> NoiseMeter:
+        """Measures the fast noise, unless it is given by monitor [m]."""
+        return NoiseMeter(self.series, self.moving, given_m, self.config, self._sampler)
 
 
 def along_axis(epochs: AlignedEpochs, config: Configuration) -> Axis:
@@ -37,15 +49,16 @@ def along_axis(epochs: AlignedEpochs, config: Configuration) -> Axis:
     matched = _match_reasons(epochs)
     reasons = otherwise(matched, epochs.odometer_reason)
     series = _along(epochs, t_s, reasons, config)
-    return Axis("along", series, _moving(epochs, t_s, config)[series.epoch], reasons)
+    return Axis("along", series, _moving(epochs, t_s, config)[series.epoch], reasons, config)
 
 
-def axes_of(epochs: AlignedEpochs, config: Configuration) -> tuple[Axis, Axis, Axis]:
+def axes_of(epochs: AlignedEpochs, config: Configuration, along: Axis | None = None) -> tuple[Axis, Axis, Axis]:
     """The three axes of the bank.
 
     Args:
         epochs: aligned epochs of one solution, arrays of shape (n,).
         config: the configuration.
+        along: the axis along the track, where it was made already.
 
     Returns:
         Along, across the track and up.
@@ -61,8 +74,8 @@ def axes_of(epochs: AlignedEpochs, config: Configuration) -> tuple[Axis, Axis, A
         ("cross", _across(epochs, t_s, matched, "cross", config), matched),
         ("up", _across(epochs, t_s, up_reasons, "up", config), up_reasons),
     )
-    cross, up = (Axis(name, series, moving[series.epoch], reasons) for name, series, reasons in built)
-    return along_axis(epochs, config), cross, up
+    cross, up = (Axis(name, series, moving[series.epoch], reasons, config) for name, series, reasons in built)
+    return along or along_axis(epochs, config), cross, up
 
 
 def _moving(epochs: AlignedEpochs, t_s: Floats, config: Configuration) -> Bools:
@@ -95,7 +108,7 @@ def _along(epochs: AlignedEpochs, t_s: Floats, reasons: Ints, config: Configurat
         scale_sigma=epochs.scale_sigma[rows],
         latency_sigma_s=epochs.latency_sigma_s[rows],
         white_m2_per_s=epochs.odometer_white_m2_per_s[rows],
-        rows_m=epochs.odometer_rows_m[rows],
+        rows_m=epochs.odometer_rows_m[rows] if epochs.odometer_rows_m.any() else None,
         period_s=epochs.odometer_period_s[rows],
     )
     return along_series(at_rows, Increments(_steps(epochs.odometer_m[rows]), _steps(epochs.speed_mps[rows])), config)

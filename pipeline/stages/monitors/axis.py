@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import fields
 
 import numpy as np
@@ -28,11 +28,22 @@ def _solved(decay: Floats, y: Floats, initial: Floats) -> Floats:
     if not len(y):
         return y
     y[0] += decay[0] * initial
-    band = np.ones((2, len(y)), order="F")
+    band = _band(len(y))
     for channel in range(y.shape[1]):
-        np.negative(decay[1:, channel], out=band[1, :-1])
-        y[:, channel : channel + 1], _ = dtbtrs(band, y[:, channel : channel + 1], uplo="L", diag="U", overwrite_b=1)
+        y[:, channel] = _solved_column(band, decay[:, channel], y[:, channel])
     return y
+
+
+def _band(rows: int) -> Floats:
+    """The two diagonals of the system: ones, and room for the decays."""
+    return np.ones((2, rows), order="F")
+
+
+def _solved_column(band: Floats, decay: Floats, y: Floats) -> Floats:
+    """One column `y`, overwritten, which begins with what was carried on."""
+    np.negative(decay[1:], out=band[1, :-1])
+    solved, _ = dtbtrs(band, y[:, None], uplo="L", diag="U", overwrite_b=1)
+    return np.asarray(solved[:, 0])
 
 
 def ewma_weight(alpha: Floats, dt_s: Floats) -> Floats:
@@ -85,19 +96,28 @@ def variance_of_ewma(
 
     c <- b phi r c + alpha g s_k (s_k - phi s_p)
     """
-    carried, fresh_m2, change = _memory(sigma_m, sigma_before_m, decorrelation)
-    coupling = np.empty_like(gain)
+    coupling = np.zeros_like(gain)
     covariances = np.empty_like(state.covariance)
-    for index, before in enumerate(state.covariance):
-        drive = np.asfortranarray(gain[:, index, None] * fresh_m2)
-        covariance = _solved(keep[:, index, None] * carried, drive, before)
-        coupling[1:, index] = (covariance[:-1] * change[1:]).sum(axis=1)
-        coupling[:1, index] = (before * change[:1]).sum(axis=1)
-        covariances[index] = covariance[-1]
+    new_m2 = np.zeros(len(gain))
+    band = _band(len(gain))
+    # Column by column, which the cache holds.
+    for source, column in enumerate(_by_source(sigma_m, sigma_before_m, decorrelation)):
+        carried, fresh_m2, change = _memory(*column)
+        has_memory = carried[1:].any()
+        for average, before in enumerate(state.covariance[:, source].tolist()):
+            covariance = gain[:, average] * fresh_m2
+            covariance[0] += keep[0, average] * carried[0] * before
+            if has_memory:  # else the drive is all there is
+                covariance = _solved_column(band, keep[:, average] * carried, covariance)
+            coupling[0, average] += before * change[0]
+            coupling[1:, average] += covariance[:-1] * change[1:]
+            covariances[average, source] = covariance[-1]
+        sigma, _, lost = column
+        new_m2 += sigma**2 * lost * (2.0 - lost)
     fresh = gain**2 * increment_m2[:, None] + 2.0 * gain * keep * coupling
     variance = linear_recurrence(keep**2, fresh, state.variance)
     # A sigma that falls quickly, though not by the step, can bring the printed recursion below what is new in it.
-    new_m2 = (sigma_m**2 * decorrelation * (2.0 - decorrelation)).sum(axis=1) + white_m2
+    new_m2 += white_m2
     return np.maximum(variance, gain**2 * new_m2[:, None]), (variance[-1], covariances)
 
 
@@ -112,15 +132,31 @@ def noise_of_ewma(
     covariance = gain * noise_m2
     if not (noise_m2.any() or state.noise_variance.any()):
         return np.zeros_like(gain), (np.zeros_like(covariance[-1]), covariance[-1])
-    before = np.concatenate([state.noise_covariance[None], covariance[:-1]])
+    before = np.empty_like(covariance)
+    before[0] = state.noise_covariance
+    before[1:] = covariance[:-1]
     variance = linear_recurrence(keep**2, 2.0 * gain * (covariance - keep * before), state.noise_variance)
     # Noise that falls from one renewal to the next can bring this below what is new in it.
     return np.maximum(variance, gain * covariance), (variance[-1], covariance[-1])
 
 
+def _by_source(
+    sigma_m: Floats, sigma_before_m: Floats, decorrelation: Floats
+) -> Iterator[tuple[Floats, Floats, Floats]]:
+    """The columns of each source."""
+    sigmas = list(sigma_m.T)
+    before = sigmas if sigma_before_m is sigma_m else list(sigma_before_m.T)
+    return zip(sigmas, before, decorrelation.T, strict=True)
+
+
+def _same(sigma_m: Floats, sigma_before_m: Floats) -> bool:
+    """No sigma changed by the step."""
+    return sigma_m is sigma_before_m or np.array_equal(sigma_m, sigma_before_m)
+
+
 def _memory(sigma_m: Floats, sigma_before_m: Floats, decorrelation: Floats) -> tuple[Floats, Floats, Floats]:
-    """Terms of the recursion: phi r, s_k (s_k - phi s_p) and phi r - 1; shapes (n, sources)."""
-    if np.array_equal(sigma_m, sigma_before_m):
+    """Terms of the recursion of one source: phi r, s_k (s_k - phi s_p) and phi r - 1; shapes (n,)."""
+    if _same(sigma_m, sigma_before_m):
         return 1.0 - decorrelation, sigma_m * (decorrelation * sigma_m), -decorrelation
     ratio = np.divide(sigma_m, sigma_before_m, out=np.ones_like(sigma_m), where=sigma_before_m > 0.0)
     carried = (1.0 - decorrelation) * ratio
@@ -136,6 +172,8 @@ def before_steps(sigma_m: Floats, decorrelation: Floats, factor: float) -> Float
     """
     before = sigma_m
     for source, (sigma, lost) in enumerate(zip(sigma_m.T, decorrelation.T, strict=True)):
+        if not sigma.size or sigma.max() <= factor * sigma.min():
+            continue
         earlier = np.concatenate([sigma[:1], sigma[:-1]])
         is_step = np.maximum(sigma, earlier) > factor * np.minimum(sigma, earlier)
         is_step &= lost < 1.0
@@ -147,10 +185,11 @@ def before_steps(sigma_m: Floats, decorrelation: Floats, factor: float) -> Float
 
 def increment_variance(sigma_m: Floats, sigma_before_m: Floats, decorrelation: Floats) -> Floats:
     """Variance of the increments by all sources together [m^2], shape (n,); 2 R (1-phi) where R stays."""
-    correlated = 2.0 * decorrelation * sigma_m * sigma_before_m
-    if np.array_equal(sigma_m, sigma_before_m):
-        return np.asarray(correlated.sum(axis=1))
-    return np.asarray(((sigma_m - sigma_before_m) ** 2 + correlated).sum(axis=1))
+    variance_m2 = np.zeros(len(sigma_m))
+    for sigma, before, lost in _by_source(sigma_m, sigma_before_m, decorrelation):
+        correlated = 2.0 * lost * sigma * before
+        variance_m2 += correlated if _same(sigma, before) else (sigma - before) ** 2 + correlated
+    return variance_m2
 
 
 # Rows evaluated at once: few after a restart, which may soon be followed by another; never more than the cache holds.
@@ -182,7 +221,10 @@ class AxisSeries:
 
     def between(self, low: int, high: int) -> AxisSeries:
         """Its rows [low, high)."""
-        return AxisSeries(**{item.name: getattr(self, item.name)[low:high] for item in fields(self)})
+        parts = {item.name: getattr(self, item.name)[low:high] for item in fields(self)}
+        if self.sigma_before_m is self.sigma_m:
+            parts["sigma_before_m"] = parts["sigma_m"]
+        return AxisSeries(**parts)
 
 
 Source = tuple[Floats, Floats]
@@ -237,8 +279,9 @@ def run_axis(
     Source:
         DIAG eq. 4-9; DOMAIN section 3, rule 2.
     """
-    noise_m2 = np.zeros((series.dt_s.size, 1 + alphas.size)) if noise_m2 is None else noise_m2
-    known_m2 = np.nan_to_num(noise_m2)
+    noise_m2 = np.zeros((series.dt_s.size, 1 + alphas.size), order="F") if noise_m2 is None else noise_m2
+    unknown = np.isnan(noise_m2)
+    known_m2 = np.where(unknown, 0.0, noise_m2) if unknown.any() else noise_m2
     state = state or AxisState.at_restart(alphas.size, series.sigma_m.shape[1], series.lasting_mps.shape[1])
     moving = ~series.fresh
     # A row that restarts has weight, keep and gain 0: nothing of before is carried over it.
@@ -257,10 +300,15 @@ def run_axis(
     responses = [linear_recurrence(keep, weight * rate_mps[:, None], before) for rate_mps, before in lasting]
     averaged_m2 = variance + noise + sum(response**2 for response in responses)
     raw_m2 = _raw_variance(series, increment_m2 + 2.0 * known_m2[:, 0])
-    sigma = np.sqrt(np.column_stack([raw_m2, averaged_m2]))
-    sigma[np.isnan(noise_m2)] = np.nan
+    sigma = np.sqrt(_beside(raw_m2, averaged_m2))
+    sigma[unknown] = np.nan
     carried = np.array([response[-1] for response in responses]).reshape(state.lasting.shape)
-    return np.column_stack([series.rate_mps, ewma]), sigma, AxisState(ewma[-1], *smooth, *fast, carried)
+    return _beside(series.rate_mps, ewma), sigma, AxisState(ewma[-1], *smooth, *fast, carried)
+
+
+def _beside(raw: Floats, averages: Floats) -> Floats:
+    """The raw monitor's column before those of the averages, in Fortran order."""
+    return np.vstack([raw[None, :], averages.T]).T
 
 
 def _raw_variance(series: AxisSeries, increment_m2: Floats) -> Floats:
@@ -275,7 +323,7 @@ class AlongEpochs:
 
     `doubt_m`: in the odometer's distance, a sum; `sigma_m`: of the Gauss-Markov errors; `digits_m`: how coarsely
     positions are written; `jitter_s`: scatter of the stamps; `white_m2_per_s`: what the odometer's distance gathers;
-    `rows_m`: quantisation noise of its rows, `period_s` apart.
+    `rows_m`: quantisation noise of its rows, `period_s` apart; None where no row of the run has any.
     """
 
     epoch: Ints
@@ -288,7 +336,7 @@ class AlongEpochs:
     scale_sigma: Floats
     latency_sigma_s: Floats
     white_m2_per_s: Floats | float
-    rows_m: Floats
+    rows_m: Floats | None
     period_s: Floats | float
 
 
@@ -310,10 +358,9 @@ def along_series(epochs: AlongEpochs, odometer: Increments, config: Configuratio
     zero = np.zeros(dt.size)
     # New at each epoch: a stamp's error times the speed, and the digits. The odometer's rows lose theirs by and by.
     memoryless_m = np.hypot(epochs.jitter_s * odometer.distance_m / dt, epochs.digits_m)
-    further = [
-        (np.abs(memoryless_m), np.ones(dt.size)),
-        (epochs.rows_m, _rows_decorrelation(dt, epochs.period_s, config.monitors)),
-    ]
+    further = [(np.abs(memoryless_m), np.ones(dt.size))]
+    if epochs.rows_m is not None:
+        further.append((epochs.rows_m, _rows_decorrelation(dt, epochs.period_s, config.monitors)))
     return AxisSeries(
         epoch=epochs.epoch,
         fresh=fresh | (np.diff(epochs.doubt_m, prepend=epochs.doubt_m[:1]) != 0.0),
@@ -323,9 +370,9 @@ def along_series(epochs: AlongEpochs, odometer: Increments, config: Configuratio
         **errors_of(epochs.sigma_m, dt, further, config.monitors),
         white_m2=epochs.white_m2_per_s * dt,
         border_m2=zero,
-        lasting_mps=np.column_stack(
+        lasting_mps=np.vstack(
             [epochs.scale_sigma * odometer.distance_m / dt, epochs.latency_sigma_s * odometer.speed_mps / dt]
-        ),
+        ).T,
     )
 
 

@@ -23,8 +23,8 @@ from pipeline.stages.epochs.verdicts import (
 )
 from pipeline.stages.monitors.axes import Axis, axes_of
 from pipeline.stages.monitors.axis import BLOCK, FIRST_BLOCK, AxisSeries, AxisState, run_axis
-from pipeline.stages.monitors.noise import OF_WALK, OF_WHITE_NOISE, NoiseMeter
-from schemas.arrays import Bools, Floats, Ints
+from pipeline.stages.monitors.noise import OF_WALK, OF_WHITE_NOISE
+from schemas.arrays import Bools, Floats, Ints, rows_of
 from schemas.config import Configuration
 from schemas.enums import NotEvaluated
 from schemas.stages import AlignedEpochs
@@ -64,7 +64,7 @@ class AxisBank:
         # Rows of the odometer scatter by nobody knows how much yet.
         self.noise_known: Bools = axis.reasons != NUMBER[NOISE_UNKNOWN]
         given_m: tuple[float, ...] | None = getattr(config.monitors, f"noise_{axis.name}_m")
-        self._meter = NoiseMeter(axis.series, axis.moving, given_m, config)
+        self._meter = axis.noise_meter(given_m)
         self._begin_at(0, None, BLOCK)
 
     def _begin_at(self, row: int, state: AxisState | None, block: int) -> None:
@@ -89,7 +89,7 @@ class AxisBank:
 
     def _store(self, part: AxisSeries, value: Floats, threshold: Floats, noise_m: Floats) -> None:
         """Write what was evaluated of some rows into the arrays by epoch."""
-        present = ~part.fresh[:, None] & self.enabled[None, :]
+        present = (self.enabled[:, None] & ~part.fresh).T
         # One noise too large, and the axis has a blind spot: none of its monitors says that all is well.
         known: Bools = np.all((noise_m <= self._config.noise_limit_m) | ~self.enabled.any(), axis=1)
         judged = present & known[:, None]
@@ -97,12 +97,13 @@ class AxisBank:
         if self._blind is not None:
             state[state == PASS] = NOT_EVALUATED
             judged &= state == FAIL
-        self.state[part.epoch] = state
-        self.value[part.epoch] = np.where(present, value, np.nan)
-        self.threshold[part.epoch] = np.where(judged, threshold, np.nan)
-        self.noise_m[part.epoch] = noise_m
-        self.window_begins[part.epoch] = part.fresh
-        self.noise_known[part.epoch] = known
+        epochs = rows_of(part.epoch)
+        self.state[epochs] = state
+        self.value[epochs] = np.where(present, value, np.nan)
+        self.threshold[epochs] = np.where(judged, threshold, np.nan)
+        self.noise_m[epochs] = noise_m
+        self.window_begins[epochs] = part.fresh
+        self.noise_known[epochs] = known
 
     def freeze(self, epoch: int) -> None:
         """No row from this epoch on enters the noise, until a restart; evaluated anew from the last block on.
@@ -135,7 +136,8 @@ class AxisBank:
     def verdicts(self) -> dict[str, Verdicts]:
         """Verdicts of the monitors of this axis by name, as far as they are evaluated."""
         unknown = np.zeros(self.value.shape[0], dtype=np.bool_)
-        unknown[self.series.epoch] = np.isnan(self.noise_m[self.series.epoch]).any(axis=1)
+        epochs = rows_of(self.series.epoch)
+        unknown[epochs] = np.isnan(self.noise_m[epochs]).any(axis=1)
         too_large: Bools = np.any(self.noise_m > self._config.noise_limit_m, axis=1)
         of_noise = first_reason((unknown, NOISE_UNKNOWN), (too_large, NOISE_TOO_LARGE))
         reasons = otherwise(self.axis.reasons, of_noise)
@@ -166,6 +168,7 @@ class MonitorBank:
         config: the configuration.
         blind_along: why those along the track cannot say that all is well, None where they can: an odometer made of the
             positions agrees with them whatever they say (DOMAIN section 5.0).
+        along_axis: the axis along the track, where the alignment made it already.
 
     Source:
         DIAG eq. 1-17; DOMAIN section 3.
@@ -177,12 +180,13 @@ class MonitorBank:
         single: Mapping[str, Verdicts],
         config: Configuration,
         blind_along: NotEvaluated | None = None,
+        along_axis: Axis | None = None,
     ):
         self._count = epochs.height
         disabled = config.monitors.disabled
         self._axes = tuple(
             AxisBank(axis, self._count, config, blind_along if axis.name == "along" else None)
-            for axis in axes_of(epochs, config)
+            for axis in axes_of(epochs, config, along_axis)
         )
         along, across, _ = self._axes
         # In a run without an odometer the axis across the track has to say where the bank begins.

@@ -26,14 +26,23 @@ OF_WHITE_NOISE = 6.0
 class NoiseMeter:
     """Fast noise of one axis, row by row of its series; rows under alarm never enter."""
 
-    def __init__(self, series: AxisSeries, moving: Bools, given_m: tuple[float, ...] | None, config: Configuration):
-        """`series`: of the whole run; `given_m`: by monitor, replaces what is measured."""
+    def __init__(
+        self,
+        series: AxisSeries,
+        moving: Bools,
+        given_m: tuple[float, ...] | None,
+        config: Configuration,
+        sampler: Sampler | None = None,
+    ):
+        """`series`: of the whole run; `given_m`: by monitor, replaces what is measured; `sampler`: of the series, where
+        another meter made one.
+        """
         self._series = series
         self._config = config.monitors
         self._limit_m2 = config.noise_limit_m**2
         self._given_m2 = None if given_m is None else np.square(np.array(given_m))
         self._memories_s = np.array([0.0, *(1.0 / alpha for alpha in self._config.ewma_alphas)])
-        sampler = _Sampler(series, moving, self._config)
+        sampler = sampler or Sampler(series, moving, self._config)
         self._renewal = sampler.renewal
         self._lags_s: list[float] = []
         self._samples: list[_SecondDifferences] = []
@@ -68,15 +77,22 @@ class NoiseMeter:
     def variance_m2(self, begin: int, end: int) -> Floats:
         """M of the rows [begin, end) by monitor: raw, then the EWMAs; NaN where not known yet."""
         if self._given_m2 is not None:
-            return np.tile(self._given_m2, (end - begin, 1))
+            return np.tile(self._given_m2[:, None], (1, end - begin)).T
         if not self._samples or begin == end:
             return np.full((end - begin, self._memories_s.size), np.nan)
         renewals = np.arange(self._renewal[begin], self._renewal[end - 1] + 1)
-        # A monitor takes the noise of the lag nearest to its memory; after a pause, that of a lag as long as the pause.
-        needed_s = np.maximum(self._memories_s, self._series.dt_s[begin:end, None])
-        columns = np.searchsorted(1.5 * np.array(self._lags_s[:-1]), needed_s)
         by_lag = self._by_lag(renewals)
-        return np.asarray(np.take_along_axis(by_lag[self._renewal[begin:end] - renewals[0]], columns, axis=1))
+        of_row = self._renewal[begin:end] - renewals[0]
+        # A monitor takes the noise of the lag nearest to its memory; after a pause, that of a lag as long as the pause.
+        bounds_s = 1.5 * np.array(self._lags_s[:-1])
+        nearest = np.searchsorted(bounds_s, self._memories_s)
+        at_least = np.searchsorted(bounds_s, self._series.dt_s[begin:end])
+        columns = (by_lag[:, lag][of_row] for lag in nearest)
+        noise_m2 = np.vstack(list(columns)).T
+        after_pause = np.flatnonzero(at_least)
+        lags = np.maximum(nearest, at_least[after_pause, None])
+        noise_m2[after_pause] = by_lag[of_row[after_pause, None], lags]
+        return np.asarray(noise_m2)
 
     def stated_excess_m2(self) -> Floats:
         """What the lags of 10 and 100 s that are ready show beyond the stated sigma, row by row [m^2], causally.
@@ -174,19 +190,38 @@ class _SecondDifferences:
     def looked_back(self, entering: Ints, ends: Ints) -> tuple[Floats, Floats, Floats]:
         """M of the counted samples in a window before each of `ends`, its relative error, the stated variance.
 
-        M is the largest over the quantiles; a window still short is filled with -inf, which sorts first.
+        M is the largest over the quantiles.
         """
         begins = np.maximum(ends - self.window, 0)
         count = np.maximum(ends - begins, 1)
-        nothing = np.full((len(self.quantiles), self.window), -np.inf)
-        windows = sliding_window_view(np.hstack([nothing, self.noise_m2[:, entering]]), self.window, axis=1)
-        ordered = np.sort(windows[:, ends])
-        # Windows are `window` wide, so the sample of a quantile stands behind the filling.
-        rank = self.window - count + np.ceil(np.array(self.quantiles)[:, None] * count).astype(np.int64) - 1
-        shown_m2 = np.take_along_axis(ordered, rank[..., None], axis=2).max(axis=(0, 2))
-        total_m2 = np.concatenate([[0.0], np.cumsum(self.stated_m2[entering])])
+        rank = np.ceil(np.array(self.quantiles)[:, None] * count).astype(np.int64) - 1
+        short = ends < self.window
+        shown_m2 = np.zeros(ends.size)
+        if short.any():
+            shown_m2[short] = self._of_short_windows(entering[: self.window], ends[short], count[short], rank[:, short])
+        if not short.all():
+            shown_m2[~short] = self._of_whole_windows(entering, begins[~short], rank[:, ~short][:, 0])
+        total_m2 = np.concatenate([[0.0], np.cumsum(self.stated_m2[entering[: int(ends.max())]])])
         pieces = np.maximum(count / self.span, 1.0)
         return np.maximum(shown_m2, 0.0), np.sqrt(2.0 / pieces), (total_m2[ends] - total_m2[begins]) / count
+
+    def _of_whole_windows(self, entering: Ints, begins: Ints, ranks: Ints) -> Floats:
+        """The largest over the quantiles, by their rank, of the windows that begin at these samples [m^2]."""
+        first = int(begins.min())
+        samples_m2 = self.noise_m2[:, entering[first : int(begins.max()) + self.window]]
+        windows = sliding_window_view(samples_m2, self.window, axis=1)[:, begins - first]
+        largest_m2 = np.full(begins.size, -np.inf)
+        for of_quantile, rank in zip(windows, ranks.tolist(), strict=True):
+            of_quantile.partition(rank, axis=1)
+            np.maximum(largest_m2, of_quantile[:, rank], out=largest_m2)
+        return largest_m2
+
+    def _of_short_windows(self, entering: Ints, ends: Ints, count: Ints, rank: Ints) -> Floats:
+        """The same of windows that begin at the first sample: filled in front with -inf, which sorts first."""
+        nothing = np.full((len(self.quantiles), self.window), -np.inf)
+        windows = sliding_window_view(np.hstack([nothing, self.noise_m2[:, entering]]), self.window, axis=1)
+        rank = (self.window - count + rank)[..., None]
+        return np.asarray(np.take_along_axis(np.sort(windows[:, ends]), rank, axis=2).max(axis=(0, 2)))
 
 
 class _Triples(NamedTuple):
@@ -205,13 +240,18 @@ class _Triples(NamedTuple):
         return np.asarray(values[self.last] - 2.0 * values[self.middle] + values[self.oldest])
 
 
-class _Sampler:
-    """Second differences by running sums, whose differences are what happened between two rows."""
+class Sampler:
+    """Second differences by running sums, whose differences are what happened between two rows; those of a lag are made
+    once.
+    """
 
     def __init__(self, series: AxisSeries, moving: Bools, config: MonitorConfig) -> None:
         self._series = series
         self._config = config
         self._t_s = np.cumsum(series.dt_s) - series.dt_s[:1]
+        self._between_s = 0.5 * (self._t_s[1:] + self._t_s[:-1])
+        self._firsts: dict[float, Ints] = {}
+        self._over: dict[float, _SecondDifferences] = {}
         self.renewal: Ints = (self._t_s // config.noise_renewal_s).astype(np.int64)
         # Only of the time before the noise is first known: later rows must not change the lags (causal).
         steps_s = series.dt_s[1:]
@@ -230,6 +270,12 @@ class _Sampler:
         self._lasting_m = [np.cumsum(rate_mps * series.dt_s) for rate_mps in series.lasting_mps.T if rate_mps.any()]
 
     def over(self, lag_s: float) -> _SecondDifferences:
+        """The second differences over a lag."""
+        if lag_s not in self._over:
+            self._over[lag_s] = self._sampled(lag_s)
+        return self._over[lag_s]
+
+    def _sampled(self, lag_s: float) -> _SecondDifferences:
         """M = (second difference^2 / quantile of chi^2 - model) / 4 (DOMAIN section 3)."""
         config = self._config
         spacing_s = max(self.period_s, 0.1 * lag_s, config.noise_spacing_s)
@@ -257,13 +303,19 @@ class _Sampler:
         """The first row t in every `spacing_s`, and the rows nearest to t - L and t - 2 L, if near enough."""
         t_s = self._t_s
         reach_s = max(0.1 * lag_s, 0.5 * self.period_s)
-        cell = np.floor(t_s / spacing_s + 1e-6)
-        last = np.flatnonzero(np.diff(cell, prepend=cell[:1] - 1.0) > 0.0)
-        between_s = 0.5 * (t_s[1:] + t_s[:-1])
-        middle, oldest = (np.searchsorted(between_s, t_s[last] - lags * lag_s) for lags in (1, 2))
-        near = (np.abs(t_s[last] - lag_s - t_s[middle]) <= reach_s) & (middle < last)
-        near &= (np.abs(t_s[last] - 2.0 * lag_s - t_s[oldest]) <= reach_s) & (oldest < middle)
+        last = self._firsts_in(spacing_s)
+        last_s = t_s[last]
+        middle, oldest = (np.searchsorted(self._between_s, last_s - lags * lag_s) for lags in (1, 2))
+        near = (np.abs(last_s - lag_s - t_s[middle]) <= reach_s) & (middle < last)
+        near &= (np.abs(last_s - 2.0 * lag_s - t_s[oldest]) <= reach_s) & (oldest < middle)
         return _Triples(last, middle, oldest).where(near)
+
+    def _firsts_in(self, spacing_s: float) -> Ints:
+        """The first row in every `spacing_s`; most lags have the same spacing."""
+        if spacing_s not in self._firsts:
+            cell = np.floor(self._t_s / spacing_s + 1e-6)
+            self._firsts[spacing_s] = np.flatnonzero(np.diff(cell, prepend=cell[:1] - 1.0) > 0.0)
+        return self._firsts[spacing_s]
 
     def _model_m2(self, lag_s: float, rows: _Triples) -> Floats:
         """Variance of the second differences by the whole model, sample by sample [m^2].

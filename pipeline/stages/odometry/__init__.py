@@ -3,11 +3,11 @@
 In: the cleaned odometer stream, vehicle file, configuration. Out: one `Odometry`, handed to every stage.
 Touches no file, and knows no position: only the sign against the path is set from one (`polarity`).
 
-Where it comes from, as declared, and from one row to the next: `rows`. Over all rows: `odometry`. By how much it may be
-off, and when a position may return after an alarm: `bound`. The sign with which a counter counts, and over slip by
-another one: `polarity`. What is movement and what noise of the rows: `driven`, `quantisation`. Shared with evidence,
-plausibility, calibration and alignment: `scale_lag`, scale and lag of any counter against another recorder, by
-`regression`.
+Where it comes from, as declared, and from one row to the next: `rows`. Over all rows: `odometry`; at given instants:
+`reading`. By how much it may be off, and when a position may return after an alarm: `bound`. The sign with which a
+counter counts, and over slip by another one: `polarity`. What is movement and what noise of the rows: `driven`,
+`quantisation`. Shared with evidence, plausibility, calibration and alignment: `scale_lag`, scale and lag of any counter
+against another recorder, by `regression`.
 """
 
 from pipeline.stages.odometry.odometry import OdometerDistance, Odometry, odometry_of

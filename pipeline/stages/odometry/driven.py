@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import polars as pl
 
-from schemas.arrays import Bools, Floats
+from schemas.arrays import Bools, Floats, runs_of
 from schemas.config import AlignConfig
 
 # Numerics: rows that are looked at together, and fewer than which are not worth it.
@@ -22,6 +22,8 @@ def with_hysteresis(distance_m: Floats, width_m: Floats) -> Floats:
 
     It stays `width_m` behind a movement, and turns once the distance came back by twice that.
     """
+    if not width_m.any():
+        return distance_m
     held_m = np.full(distance_m.size, np.nan)
     rows = np.flatnonzero(np.isfinite(distance_m))
     if rows.size == 0:
@@ -116,18 +118,17 @@ def driven_or_left_m(distance_m: Floats, moving: Bools) -> Floats:
     """Distance driven up to each sample [m]; of a stand only the farthest it was from its place, as noise would add
     up.
     """
-    step_m = np.abs(np.diff(distance_m))
-    first = np.flatnonzero(np.diff(moving, prepend=~moving[:1]))
-    lengths = np.diff(first, append=moving.size)
-    span = np.repeat(np.arange(first.size), lengths)  # of steps that all move, or all stand
-    away_m = np.abs(distance_m[1:] - np.repeat(distance_m[first], lengths))
-    # By polars: an offset for each span would round by what the log holds later.
-    spans = pl.DataFrame({"away_m": away_m, "span": span})
-    farthest_m = spans.select(pl.col("away_m").cum_max().over("span")).to_series().to_numpy()
-    begins = np.zeros(moving.size, dtype=np.bool_)
-    begins[first] = True
-    left_m = np.where(begins, farthest_m, np.diff(farthest_m, prepend=0.0))
-    return np.concatenate([[0.0], np.cumsum(np.where(moving, step_m, left_m))])
+    driven_m = np.abs(np.diff(distance_m))
+    firsts, lasts = runs_of(~moving)
+    lengths = lasts + 1 - firsts
+    stand = np.repeat(np.arange(firsts.size), lengths)
+    away_m = np.abs(distance_m[1:][~moving] - np.repeat(distance_m[firsts], lengths))
+    # By polars: an offset for each stand would round by what the log holds later.
+    stands = pl.DataFrame({"away_m": away_m, "stand": stand})
+    farthest_m = stands.select(pl.col("away_m").cum_max().over("stand")).to_series().to_numpy()
+    begins = np.diff(stand, prepend=-1) > 0
+    driven_m[~moving] = np.where(begins, farthest_m, np.diff(farthest_m, prepend=0.0))
+    return np.concatenate([[0.0], np.cumsum(driven_m)])
 
 
 def evenly_driven(

@@ -10,8 +10,9 @@ import numpy as np
 import polars as pl
 
 from pipeline.stages.odometry.bound import LEAST_DOUBT_M, LOST_M, Bound, is_lost
-from pipeline.stages.odometry.driven import evenly_driven, hysteresis_m, moving_steps, travelled_m
+from pipeline.stages.odometry.driven import driven_or_left_m, evenly_driven, moving_steps, travelled_m
 from pipeline.stages.odometry.quantisation import KnownNoise, Noise, noise_of_rows, row_periods_s
+from pipeline.stages.odometry.reading import OdometerReading
 from pipeline.stages.odometry.rows import (
     Contradiction,
     StepDistances,
@@ -105,7 +106,7 @@ class Odometry:
 
     def seconds(self, t_ns: Ints) -> Floats:
         """Instants [ns] as seconds since `epoch_ns`."""
-        return ((t_ns - self.epoch_ns) * 1e-9).astype(np.float64)
+        return np.asarray((t_ns - self.epoch_ns) * 1e-9, dtype=np.float64)
 
     def known_at(self, t_ns: Ints) -> Bools:
         """Whether the distance is known at instants [ns], as `known_at_s`."""
@@ -113,16 +114,16 @@ class Odometry:
 
     def slips_at_s(self, t_s: Floats) -> Bools:
         """Whether the sample before or after is slip."""
-        return self._slips_between(*self._around(t_s))
+        return self.read(t_s).slips
 
     def doubt_at_s(self, t_s: Floats) -> Floats:
         """Distances compare to a millimetre where it is the same, and not at all across a loss (`is_lost`) [m]."""
-        return np.interp(t_s, self.t_s, self.doubt_m)
+        return self.read(t_s).doubt_m
 
     def distance_at(self, t_ns: Ints) -> Floats:
         """Distance as recorded at instants [m]; NaN where it is not known."""
-        t_s = self.seconds(t_ns)
-        return np.where(self.known_at_s(t_s), self.distance_at_s(t_s), np.nan)
+        at = self.read(self.seconds(t_ns))
+        return np.where(at.known, at.distance_m, np.nan)
 
     def travelled_at(self, t_ns: Ints) -> Floats:
         """Distance driven since the first row [m], to and fro; interpolated over gaps."""
@@ -196,18 +197,28 @@ class Odometry:
 
     def steps_m(self, t_ns: Ints) -> Floats:
         """The same from each instant to the next [m], shape (n - 1,)."""
-        return self.proved_between(t_ns[:-1], t_ns[1:])
+        return self._where_sure(np.diff(self.distance_at(t_ns)), self.bound_between_m(t_ns[:-1], t_ns[1:]) == 0.0)
 
     def _counted_between(self, begin_ns: Ints, end_ns: Ints, sure: Bools) -> Floats:
         """Recorded distance between instants, scaled [m]; NaN where not `sure`."""
-        moved_m = self.distance_at(end_ns) - self.distance_at(begin_ns)
+        return self._where_sure(self.distance_at(end_ns) - self.distance_at(begin_ns), sure)
+
+    def _where_sure(self, moved_m: Floats, sure: Bools) -> Floats:
+        """Recorded distances, scaled [m]; NaN where not `sure`."""
         return np.asarray((self.scale or 1.0) * np.where(sure, moved_m, np.nan))
 
-    def increments(self, t_ns: Ints, scale: Floats, latency_s: Floats) -> Increments:
-        """Both ends of a step with the scale and latency in use at the later one."""
-        before, now = self._steps_s(t_ns, latency_s)
-        distance = scale * (self.distance_at_s(now) - self.distance_at_s(before))
-        return Increments(distance, scale * (self.speed_at_s(now) - self.speed_at_s(before)))
+    def increments(
+        self, t_ns: Ints, scale: Floats, latency_s: Floats, now: OdometerReading | None = None
+    ) -> Increments:
+        """Both ends of a step with the scale and latency in use at the later one.
+
+        `now`: the reading at the later ends, if it was made already.
+        """
+        before_s, now_s = self._steps_s(t_ns, latency_s)
+        before = self.read(before_s)
+        now = now or self.read(now_s)
+        distance = scale * (now.distance_m - before.distance_m)
+        return Increments(distance, scale * (now.speed_mps - before.speed_mps))
 
     def driven(self, t_ns: Ints, scale: Floats, latency_s: Floats) -> Floats:
         """Distance driven between consecutive instants, to and fro [m]."""
@@ -220,24 +231,17 @@ class Odometry:
         now = t_s - latency_s
         return np.concatenate([now[:1], t_s[:-1] - latency_s[1:]]), now
 
-    def white_m2_per_s_at(self, t_s: Floats) -> Floats:
-        """White noise of the steps to these instants as known there, with that of bridged resets [m^2/s]."""
-        white = self.noise_at_s(t_s).white_m2_per_s
-        dt_s = np.diff(t_s)
-        white[1:] += np.where(dt_s > 0.0, np.diff(self.bridged_m2_at(t_s)) / np.maximum(dt_s, 1e-9), 0.0)
-        return white
-
     def bridged_m2_at(self, t_s: Floats) -> Floats:
         """Sum of the variances over bridged resets up to each instant [m^2]."""
         return np.zeros(t_s.size) if self.bridged_m2 is None else np.interp(t_s, self.t_s, self.bridged_m2)
 
+    def read(self, t_s: Floats) -> OdometerReading:
+        """All that the odometer says of these instants."""
+        return OdometerReading(self, t_s)
+
     def known_at_s(self, t_s: Floats) -> Bools:
         """Between two samples without a pause, none of which reports slip."""
-        before, after = self._around(t_s)
-        paused = (before != after) & self.pause[np.minimum(before, self.pause.size - 1)]
-        inside = (t_s >= self.t_s[0]) & (t_s <= self.t_s[-1])
-        known: Bools = inside & ~paused & ~self._slips_between(before, after)
-        return known
+        return self.read(t_s).known
 
     def distance_at_s(self, t_s: Floats) -> Floats:
         """Interpolated where it is not known, the end value outside the recording [m]."""
@@ -245,10 +249,7 @@ class Odometry:
 
     def speed_at_s(self, t_s: Floats) -> Floats:
         """Mean over the second before [m/s]."""
-        start = np.maximum(t_s - self.config.speed_window_s, self.t_s[0])
-        span = np.maximum(np.minimum(t_s, self.t_s[-1]) - start, 1e-9)
-        speed: Floats = (self.distance_at_s(t_s) - self.distance_at_s(start)) / span
-        return speed
+        return self.read(t_s).speed_mps
 
     def speed_about(self, t_ns: Ints) -> Floats:
         """True speed over as much of the second about each instant as was recorded [m/s]; a best guess over a pause."""
@@ -259,18 +260,7 @@ class Odometry:
 
     def noise_at_s(self, t_s: Floats) -> KnownNoise:
         """The noise as the rows up to each instant show it."""
-        return self.known_noise.at(self._sample_at(t_s))
-
-    def known_row_sigma_m(self, t_s: Floats) -> Floats:
-        """Sigma of the rows' noise, as known at these instants [m]."""
-        return np.sqrt(self.noise_at_s(t_s).row_m2(self.speed_at_s(t_s)))
-
-    def hysteresis_m(self, t_s: Floats) -> Floats:
-        """How far the distance may leave the held distance before that follows, as known at these instants [m].
-
-        Before it is known by how much rows scatter nothing moves; what was driven counts once it is.
-        """
-        return np.where(self.noise_at_s(t_s).shown, hysteresis_m(self.known_row_sigma_m(t_s), self.config), np.inf)
+        return self.read(t_s).noise
 
     def row_sigma_m(self, t_s: Floats) -> Floats:
         """Sigma of the rows' noise, as the run shows it [m]."""
@@ -278,36 +268,38 @@ class Odometry:
             return np.zeros(t_s.size)
         return np.sqrt(self.noise.quantisation.variance_m2(self.speed_at_s(t_s)))
 
-    def _sample_at(self, t_s: Floats) -> Ints:
-        """The last sample not after each instant; the first one before the recording."""
-        index: Ints = np.searchsorted(self.t_s, t_s, side="right") - 1
-        return index.clip(0, self.t_s.size - 1)
+    @cached_property
+    def has_pauses(self) -> bool:
+        """Anywhere between two samples nothing is interpolated."""
+        return bool(self.pause.any())
 
-    def _slips_between(self, before: Ints, after: Ints) -> Bools:
-        """Whether a wheel slipped at either of two rows."""
-        slips: Bools = self.slip[before] | self.slip[after]
-        return slips
-
-    def _around(self, t_s: Floats) -> tuple[Ints, Ints]:
-        """Samples before and after each instant; twice the same at a sample."""
-        after = np.searchsorted(self.t_s, t_s, side="left").clip(0, self.t_s.size - 1)
-        before = np.where(self.t_s[after] == t_s, after, np.maximum(after - 1, 0))
-        return before, after
+    @cached_property
+    def has_slips(self) -> bool:
+        """A sample reports slip."""
+        return bool(self.slip.any())
 
     @cached_property
     def _moving_s(self) -> tuple[Floats, Floats]:
         """Times, and for how long the train has moved up to each [s]."""
         at_s = self.t_s
-        at_m = self.distance_m
-        if self.noise.quantisation:
-            at_s, at_m = evenly_driven(at_s, at_m, self.row_sigma_m(at_s), self.deadband_mps, self.config)
+        if not self.noise.quantisation:
+            return at_s, _sums(np.where(self._moving_by_rows, np.diff(at_s), 0.0))
+        row_sigma_m = self.row_sigma_m(at_s)
+        at_s, at_m = evenly_driven(at_s, self.distance_m, row_sigma_m, self.deadband_mps, self.config)
         moving = moving_steps(at_s, at_m, self.deadband_mps, self.config.speed_window_s)
         return at_s, _sums(np.where(moving, np.diff(at_s), 0.0))
 
     @cached_property
+    def _moving_by_rows(self) -> Bools:
+        """Whether the train moves in each step, by the distance as it is."""
+        return moving_steps(self.t_s, self.distance_m, self.deadband_mps, self.config.speed_window_s)
+
+    @cached_property
     def _travelled_m(self) -> Floats:
         """Distance travelled at each row, whichever way the train went [m]."""
-        width_m = self.hysteresis_m(self.t_s)
+        width_m = self.read(self.t_s).hysteresis_m
+        if not width_m.any():
+            return np.asarray(np.maximum.accumulate(driven_or_left_m(self.distance_m, self._moving_by_rows)))
         return travelled_m(self.t_s, self.distance_m, width_m, self.deadband_mps, self.config.speed_window_s)
 
 
@@ -348,8 +340,7 @@ def odometry_of(stream: pl.DataFrame | None, vehicle: Vehicle, config: Configura
     uncounted_pause = pause & ~counted
     lost = uncounted_pause | slip[1:]
     guessed = uncounted_pause & ~unknown
-    guess_m, guess_doubt_m = _guessed_distances(moved_m, dt_s, speed, period_s[1:], config)
-    moved_m = np.where(guessed, guess_m, moved_m)
+    moved_m, guess_doubt_m = _guessed_distances(guessed, moved_m, dt_s, speed, period_s[1:], config)
     distance_m = _sums(np.where(unknown, 0.0, moved_m))
     whole = counted & ~lost & ~pause
     noise, known_noise = noise_of_rows(t_s, distance_m, whole, counts, period_s, declared_mps(stream), config)
@@ -396,31 +387,39 @@ def _contradicted(
 ) -> Contradiction:
     """Whether the speeds contradict the counted distance beyond the noise of its rows."""
     align = config.align
-    begin_s = np.maximum(t_s - align.speed_window_s, t_s[0])
-    speed_mps = (distance_m - np.interp(begin_s, t_s, distance_m)) / np.maximum(t_s - begin_s, 1e-9)
-    rows_m = align.sure_sigmas * np.sqrt(2.0 * noise.row_m2(speed_mps))
+    rows_m = np.zeros(t_s.size)
+    if noise.scatters:
+        begin_s = np.maximum(t_s - align.speed_window_s, t_s[0])
+        speed_mps = (distance_m - np.interp(begin_s, t_s, distance_m)) / np.maximum(t_s - begin_s, 1e-9)
+        rows_m = align.sure_sigmas * np.sqrt(2.0 * noise.row_m2(speed_mps))
     recorded_m = np.where(distances.counted & ~distances.odd, distances.moved_m, np.nan)
     return contradicted_by_speeds(t_s, recorded_m, distances.driven_m, rows_m, config.matching.deadband_mps, align)
 
 
 def _guessed_distances(
-    moved_m: Floats, dt_s: Floats, speed_mps: Floats, period_s: Floats, config: Configuration
+    guessed: Bools, moved_m: Floats, dt_s: Floats, speed_mps: Floats, period_s: Floats, config: Configuration
 ) -> tuple[Floats, Floats]:
-    """The distance over a pause of speeds at each step, and by how much it may be off [m].
+    """Distances with those over the pauses that are to be guessed by speeds, and by how much these may be off [m].
 
     Mean speed x dt (`moved_m`), with acceleration and braking up to b. But some loggers write nothing at a stand: where
     the train stands at one row and at the other is no faster than it gets in a period, it drove for a period before and
     after at most. Half of that is the distance; it may have stood then, or gone on at the slower speed.
     """
+    doubt_m = np.zeros(moved_m.size)
+    steps = np.flatnonzero(guessed)
+    if not steps.size:
+        return moved_m, doubt_m
     deadband_mps = config.matching.deadband_mps
     braking_mps2 = config.align.braking_mps2
-    slower_mps, faster_mps = np.sort(np.abs([speed_mps[:-1], speed_mps[1:]]), axis=0)
-    at_standstill = (slower_mps <= deadband_mps) & (faster_mps <= deadband_mps + braking_mps2 * period_s)
-    stand_m = 0.5 * period_s * (speed_mps[:-1] + speed_mps[1:])
-    stand_doubt_m = 0.5 * period_s * (slower_mps + faster_mps) + slower_mps * dt_s
-    return np.where(at_standstill, stand_m, moved_m), np.where(
-        at_standstill, stand_doubt_m, 0.25 * braking_mps2 * dt_s**2
-    )
+    begin_mps, end_mps, steps_s, periods_s = speed_mps[steps], speed_mps[steps + 1], dt_s[steps], period_s[steps]
+    slower_mps, faster_mps = np.sort(np.abs([begin_mps, end_mps]), axis=0)
+    at_standstill = (slower_mps <= deadband_mps) & (faster_mps <= deadband_mps + braking_mps2 * periods_s)
+    stand_m = 0.5 * periods_s * (begin_mps + end_mps)
+    stand_doubt_m = 0.5 * periods_s * (slower_mps + faster_mps) + slower_mps * steps_s
+    moved_m = moved_m.copy()
+    moved_m[steps] = np.where(at_standstill, stand_m, moved_m[steps])
+    doubt_m[steps] = np.where(at_standstill, stand_doubt_m, 0.25 * braking_mps2 * steps_s**2)
+    return moved_m, doubt_m
 
 
 def _slip_doubt_m(moved_m: Floats, dt_s: Floats, slip: Bools, sigma_mps: Floats, config: AlignConfig) -> Floats:
@@ -428,6 +427,8 @@ def _slip_doubt_m(moved_m: Floats, dt_s: Floats, slip: Bools, sigma_mps: Floats,
 
     A share of the step, or its reported sigma times dt: the error lasts while it slips. A locked wheel counts nothing.
     """
+    if not slip.any():
+        return np.zeros(moved_m.size)
     sigma_mps = np.nan_to_num(np.fmax(sigma_mps[1:], sigma_mps[:-1]))
     doubt_m = np.maximum(np.maximum(config.slip_way_share * np.abs(moved_m), sigma_mps * dt_s), LEAST_DOUBT_M)
     return np.where(slip[1:] | slip[:-1], doubt_m, 0.0)

@@ -8,6 +8,7 @@ show, evidence and calibration what the run shows.
 from __future__ import annotations
 
 from dataclasses import fields
+from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
@@ -80,6 +81,8 @@ def scatter_pieces(
     config: AlignConfig,
 ) -> ScatterPieces:
     """`whole` (rows - 1,): steps that are recorded; `period_s` of the rows and their white noise, as known at each."""
+    if not whole.any():
+        return ScatterPieces(np.zeros(0, dtype=np.int64), *np.zeros((3, 0)))
     shape = _moving_pieces(t_s, distance_m, whole, period_s, deadband_mps, config)
     pieces = ScatterPieces(shape.end, *np.zeros((3, shape.end.size)))
     for count in np.unique(shape.rows).tolist():
@@ -274,6 +277,11 @@ class KnownNoise:
     period_s: Floats
     shown: Bools
 
+    @cached_property
+    def scatters(self) -> bool:
+        """Any row has a scatter."""
+        return bool(self.still_m2.any() or self.moving_s2.any() or self.faster_s2.any())
+
     def at(self, samples: Ints) -> KnownNoise:
         """The scatter at some of the samples."""
         return KnownNoise(*(getattr(self, each.name)[samples] for each in fields(self)))
@@ -286,8 +294,12 @@ class KnownNoise:
 
 def row_periods_s(t_ns: Ints) -> Floats:
     """The period of the rows as known before each; of the first step nothing is known but that step."""
+    steps_ns = np.diff(t_ns)
+    first_s = steps_ns[0] / NS_PER_S
+    if (steps_ns == steps_ns[0]).all():
+        return np.full(t_ns.size, first_s)
     period_s = periods_before_s(t_ns)
-    period_s[:2] = (t_ns[1] - t_ns[0]) / NS_PER_S
+    period_s[:2] = first_s
     return period_s
 
 
@@ -315,7 +327,9 @@ def noise_of_rows(
     )
     # Rows far apart, or of speeds alone, have no such noise.
     none = (period_s > align.straight_s) | ~np.concatenate([whole[:1], whole])
-    first_m2 = np.where(none, 0.0, first_scatter_m2(t_s, distance_m, period_s, white_m2_per_s, align))
+    first_m2 = np.zeros(t_s.size)
+    if not none.all():
+        first_m2 = np.where(none, 0.0, first_scatter_m2(t_s, distance_m, period_s, white_m2_per_s, align))
     known = known_at_rows(pieces, first_m2, config.monitors.noise_renewal_s, t_s, align)
     return noise, KnownNoise(
         white_m2_per_s=white_m2_per_s,

@@ -20,7 +20,7 @@ def declared_origin(stream: pl.DataFrame, vehicle: Vehicle) -> Origin:
 
     Of rows that say different things the origin that proves least: GNSS before a filter before unknown.
     """
-    declared = stream["origin"].cast(pl.String).unique().to_list() if "origin" in stream.columns else [None]
+    declared = stream["origin"].unique().cast(pl.String).to_list() if "origin" in stream.columns else [None]
     unsaid = vehicle.odometer_origin or Origin.UNKNOWN
     origins = {unsaid if name in (None, Origin.UNKNOWN.value) else Origin(name) for name in declared}
     return max(origins, key=_WORST_LAST.index, default=unsaid)
@@ -150,6 +150,9 @@ def contradicted_by_speeds(
     same. Speeds that never agreed with the distance contradict nothing.
     """
     both = np.isfinite(recorded_m) & np.isfinite(driven_m)
+    found = Contradiction(np.zeros(both.size, dtype=np.bool_), *np.zeros((2, both.size)))
+    if not both.any():
+        return found
     recorded_sum_m, driven_sum_m, moved_m = (
         np.concatenate([[0.0], np.cumsum(np.where(both, values, 0.0))])
         for values in (recorded_m, driven_m, np.maximum(np.abs(recorded_m), np.abs(driven_m)))
@@ -160,7 +163,6 @@ def contradicted_by_speeds(
     apart_m = np.abs((driven_sum_m - recorded_sum_m) - (driven_sum_m - recorded_sum_m)[before])
     allowed_m = share * (moved_m - moved_m[before]) + deadband_mps * (t_s - t_s[before]) + rows_m
     parts = (apart_m > allowed_m) & np.concatenate([[False], both])
-    found = Contradiction(np.zeros(both.size, dtype=np.bool_), *np.zeros((2, both.size)))
     for first, last in spans_of(parts):
         run = slice(int(before[first]), last)
         if not agreed[run.start]:
@@ -328,7 +330,10 @@ def filled_in(
 
 def slips_of(stream: pl.DataFrame, config: AlignConfig) -> Bools:
     """Whether a row is slip, by its flag or by a sigma of the speed beyond any use."""
-    slips: Bools = truths(stream["slip"]) | (floats(stream, "sigma_speed_mps") > config.slip_sigma_mps)
+    declared = stream["sigma_speed_mps"]
+    slips = truths(stream["slip"])
+    if declared.null_count() < declared.len():
+        slips |= floats(stream, "sigma_speed_mps") > config.slip_sigma_mps
     return slips
 
 
@@ -339,4 +344,6 @@ _DECLARED_ROWS = 100
 def declared_mps(stream: pl.DataFrame) -> Floats:
     """The usual sigma of the speed as declared up to each row [m/s]; NaN where none is."""
     declared = stream["sigma_speed_mps"].cast(pl.Float64)
+    if declared.null_count() == declared.len():
+        return np.full(declared.len(), np.nan)
     return declared.rolling_median(_DECLARED_ROWS, min_samples=1).to_numpy()

@@ -221,7 +221,7 @@ def test_a_bridged_reset_has_its_own_noise() -> None:
     t = np.arange(20.0)
     odometry = odometry_from(odometer_of(t, distance_m=500.0 + 20.0 * t - np.where(t >= 10.0, 600.0, 0.0)))
     expected = np.where(t == 10.0, 0.05**2 + 0.6**2, 0.05**2)
-    np.testing.assert_allclose(odometry.white_m2_per_s_at(t), expected)
+    np.testing.assert_allclose(odometry.read(t).white_m2_per_s, expected)
 
 
 def test_reversing_noise_and_single_rows_are_no_reset():
