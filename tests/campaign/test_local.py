@@ -267,7 +267,7 @@ def test_a_worker_that_dies_or_stays_while_it_starts_costs_no_attempt(
     plan = plan_of(small_trial, tmp_path)
     monkeypatch.setattr(SpawnProcess, "start", start)
     large = Site(pl.DataFrame({"x": range(10**5)}), pl.DataFrame(), None)
-    monkeypatch.setattr(ground, "_held", {**ground._held, ("other", SiteConfig()): large})
+    monkeypatch.setattr(ground, "_kept_sites", {**ground._kept_sites, ("other", SiteConfig()): large})
     if signum == signal.SIGSTOP:
         monkeypatch.setattr(WAITS, "start_s", 8.0)
     summary = run_campaign(plan, jobs=2)
