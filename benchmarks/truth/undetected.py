@@ -18,6 +18,7 @@ from typing import Any
 
 import numpy as np
 import polars as pl
+from schemas.monitors import MONITORS
 
 from benchmarks.results import Figure
 from datasets.faults import FaultKind, FaultSpec
@@ -32,7 +33,6 @@ from pipeline.studies.undetected.profile import FaultProfile, profile_at
 from schemas.arrays import floats, times_ns
 from schemas.config import Configuration, Vehicle
 from schemas.run import RunLog, Site
-from schemas.tables import MONITORS
 
 RUNS = 200
 CURVED_RUNS = 50

@@ -12,6 +12,7 @@ from functools import partial
 
 import numpy as np
 import polars as pl
+from schemas.monitors import MONITORS
 
 from datasets.experiment.catalogue_faults import CatalogueFault, Journey, catalogue
 from datasets.experiment.catalogue_report import catalogue_page, faults_table, monitors_table
@@ -26,7 +27,6 @@ from schemas.config import Configuration, Vehicle
 from schemas.frozen import frozen
 from schemas.inputs import BaliseReads
 from schemas.run import RunLog, RunTables, Site
-from schemas.tables import MONITORS
 
 REPETITIONS = 40
 RATE_HZ = 1.0

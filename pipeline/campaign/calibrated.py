@@ -10,7 +10,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
-from pipeline.campaign.plan import Plan, RunJob, find_runs, site_of
+from pipeline.campaign.plan import Plan, RunJob, find_runs, site_at
 from pipeline.campaign.recorded_log import RecordedLog
 from pipeline.read.site.route import with_route
 from pipeline.results.workers import mapped
@@ -84,7 +84,7 @@ def _source(job: RunJob) -> _CalibrationRun:
     try:
         with log.here() as path:
             run = log.read(path)
-        site = site_of(job.site, job.site_digest, job.config.site)
+        site = site_at(job.site, job.site_digest, job.config.site)
         site = with_route(site, job.route, job.config.site) if job.route else site
         observed = observe(run, site, job.vehicle, job.config, run.main_solution())
     except InputError as error:

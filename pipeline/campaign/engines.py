@@ -22,7 +22,7 @@ from typing import Any
 
 from pipeline.campaign.interruption import StopRun, answered
 from pipeline.campaign.outcome import NO_MEMORY, Result, RunFailure, overdue
-from pipeline.campaign.plan import RunJob, held, hold
+from pipeline.campaign.plan import RunJob, keep_site, kept_sites
 from pipeline.campaign.waits import WAITS
 from pipeline.campaign.worker import fail_run, replay_one
 from pipeline.results.workers import single_threaded_children
@@ -120,7 +120,7 @@ class LocalEngine(Engine):
         # and a start with more than the pipe takes would wait for ever: the site goes through a file.
         self._folder = TemporaryDirectory(prefix="balise-")
         ground = Path(self._folder.name) / "ground"
-        ground.write_bytes(pickle.dumps(held()))
+        ground.write_bytes(pickle.dumps(kept_sites()))
         self._idle = [_WorkerSlot(ground) for _ in range(jobs)]
         self._busy: dict[Result, _WorkerSlot] = {}
         self.start_limit_s = WAITS.start_s
@@ -251,12 +251,12 @@ def _held_back(signum: int) -> Iterator[None]:
 
 
 def _begin_worker(ground: Path) -> None:
-    """Runs first in a worker: leave Ctrl-C to the parent, go when the parent goes, hold what the parent has read."""
+    """Runs first in a worker: leave Ctrl-C to the parent, go when the parent goes, keep the sites of the parent."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     threading.Thread(target=_go_with_parent, daemon=True).start()
     sites: list[tuple[Site, SiteConfig]] = pickle.loads(ground.read_bytes())
     for site, config in sites:
-        hold(site, config)
+        keep_site(site, config)
 
 
 def _go_with_parent() -> None:

@@ -20,30 +20,30 @@ from schemas.run import STREAMS, Site
 from schemas.version import SOFTWARE
 
 # At most one, by digest of its files and configuration: the same content is the same site, wherever it lies.
-_held: dict[tuple[str, SiteConfig], Site] = {}
+_kept_sites: dict[tuple[str, SiteConfig], Site] = {}
 
 
-def hold(site: Site, config: SiteConfig) -> None:
-    """Keep the site of this process, so that no run reads it again."""
-    _held.clear()
-    _held[site.digest, config] = site
+def keep_site(site: Site, config: SiteConfig) -> None:
+    """Keep this site, and no other, in this process, so that no run reads it again."""
+    _kept_sites.clear()
+    _kept_sites[site.digest, config] = site
 
 
-def held() -> list[tuple[Site, SiteConfig]]:
-    """What a new worker is to hold."""
-    return [(site, config) for (_, config), site in _held.items()]
+def kept_sites() -> list[tuple[Site, SiteConfig]]:
+    """The sites of this process, for a new worker to keep."""
+    return [(site, config) for (_, config), site in _kept_sites.items()]
 
 
-def site_of(address: str, digest: str, config: SiteConfig) -> Site:
-    """The site of this digest, read where this process does not hold it. Raises `SiteError` where it has changed."""
-    if (digest, config) not in _held:
+def site_at(address: str, digest: str, config: SiteConfig) -> Site:
+    """The site of this digest, read where this process does not keep it. Raises `SiteError` where it has changed."""
+    if (digest, config) not in _kept_sites:
         storage.reach(address)  # or a worker that the store does not answer would end the campaign, not fail its run
         site = read_site(address, config)
         if site.digest != digest:
             remedy = "Start the campaign again."
             raise SiteError("has changed since the campaign began", place=redacted(address), remedy=remedy)
-        hold(site, config)
-    return _held[digest, config]
+        keep_site(site, config)
+    return _kept_sites[digest, config]
 
 
 _NULL_OF_HIVE = "__HIVE_DEFAULT_PARTITION__"
@@ -129,7 +129,7 @@ def make_plan(
         raise UsageError(error.message, place=error.place, expected=error.expected, remedy=error.remedy) from None
     ground = read_site(site, config.site)
     refuse_unrelated(ground, site)
-    hold(ground, config.site)
+    keep_site(ground, config.site)
     base = RunJob(
         run_id="",
         address="",

@@ -18,7 +18,7 @@ from pipeline.campaign.outcome import (
     outcome_of,
     worst,
 )
-from pipeline.campaign.plan import RunJob, digests, site_of
+from pipeline.campaign.plan import RunJob, digests, site_at
 from pipeline.campaign.recorded_log import RecordedLog
 from pipeline.campaign.resume import proof_of
 from pipeline.read.site.route import with_route
@@ -57,7 +57,7 @@ def replay_one(job: RunJob) -> RunOutcome:
 def _replay_one(job: RunJob, log: RecordedLog) -> RunOutcome:
     """Replay a run, unless its results are there already."""
     _same_software(job)
-    site = site_of(job.site, job.site_digest, job.config.site)
+    site = site_at(job.site, job.site_digest, job.config.site)
     if (known := log.known_digest()) and _is_done(job, known):
         return _earlier(job, log)
     with log.here() as path:

@@ -10,6 +10,7 @@ from dataclasses import replace
 
 import numpy as np
 import polars as pl
+from schemas.monitors import ALL_MONITORS
 
 from pipeline.stages.alignment.align import alignment, odometer_at
 from pipeline.stages.epochs.verdicts import MonitoredEpochs, Verdicts
@@ -26,7 +27,6 @@ from schemas.arrays import times_ns
 from schemas.enums import NotEvaluated
 from schemas.frozen import frozen
 from schemas.stages import AlignedEpochs
-from schemas.tables import ALL_MONITORS
 
 _AGAINST_ODOMETER = tuple(monitor.name for monitor in ALL_MONITORS if monitor.against_odometer)
 

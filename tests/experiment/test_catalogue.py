@@ -5,6 +5,7 @@ from pathlib import Path
 import numpy as np
 import polars as pl
 import pytest
+from schemas.monitors import MONITORS
 
 from datasets.experiment import EXPERIMENTS
 from datasets.experiment import catalogue as module
@@ -21,7 +22,6 @@ from datasets.experiment.catalogue_report import catalogue_page, faults_table, m
 from pipeline.stages.track.geodesy import point_distances_m
 from schemas.config import Configuration, MonitorConfig
 from schemas.run import RunLog, Site
-from schemas.tables import MONITORS
 
 FAULTS = {fault.name: fault for fault in catalogue()}
 

@@ -7,13 +7,13 @@ from typing import Any
 import numpy as np
 import polars as pl
 import pytest
+from schemas.monitors import BANK_MONITORS
 
 from pipeline.stages.track.geodesy import SEMI_MAJOR_AXIS_M
 from schemas.arrays import floats, times_ns
 from schemas.config import Vehicle
 from schemas.enums import NotEvaluated, Origin
 from schemas.run import RunLog, RunTables
-from schemas.tables import BANK_MONITORS
 from schemas.words import verdict_figures_words
 from tests.replay.journeys import VEHICLE, journey, replay
 
@@ -137,9 +137,9 @@ def test_without_an_odometer_there_is_no_origin() -> None:
     assert "odometer_origin_unknown" not in found["reasons"]
 
 
-@pytest.mark.parametrize(("origin", "told"), [(Origin.WHEEL, True), (None, False), (Origin.GNSS, False)])
-def test_only_an_independent_odometer_tells_motion(origin: Origin | None, told: bool) -> None:
+@pytest.mark.parametrize(("origin", "known"), [(Origin.WHEEL, True), (None, False), (Origin.GNSS, False)])
+def test_only_an_independent_odometer_tells_motion(origin: Origin | None, known: bool) -> None:
     run, site = journey(gnss=GNSS, motion=MOTION)
     tables = replay(said(run, origin).with_streams(reference=None), site, VEHICLE)
-    assert tables.epochs["moving"].is_not_null().any() is told
-    assert (row(tables)["availability"] is not None) is told
+    assert tables.epochs["moving"].is_not_null().any() is known
+    assert (row(tables)["availability"] is not None) is known

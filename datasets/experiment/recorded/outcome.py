@@ -9,6 +9,7 @@ from dataclasses import replace
 
 import numpy as np
 import polars as pl
+from schemas.monitors import MONITORS, SCALES
 
 from datasets.experiment.recorded.baseline import Baseline, Onset, instant
 from datasets.experiment.tables import Row
@@ -25,7 +26,6 @@ from schemas.arrays import NS_PER_S, Bools, Floats, Ints, flags, floats, ints, r
 from schemas.errors import InputError
 from schemas.frozen import frozen
 from schemas.run import RunLog
-from schemas.tables import MONITORS, SCALES
 
 # Epochs before the onset that the time in use is reckoned from: a negation in force there has no part in it.
 _LEAD_S = 30.0

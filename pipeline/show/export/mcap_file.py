@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import IO, Literal
 
 import polars as pl
+from schemas.monitors import MONITORS
 
 from pipeline.show.export.events import hazard_entries, passage_entries
 from pipeline.show.export.gis import balises_geojson, track_geojson
@@ -20,7 +21,6 @@ from pipeline.show.export.positions import as_gnss, positions_of
 from pipeline.storage import whole_file
 from pipeline.storage.described import PREFIX
 from schemas.run import RunLog, RunTables, Site
-from schemas.tables import MONITORS
 
 PositionMessage = Literal["foxglove", "ros"]
 Compression = Literal["zstd", "lz4", "none"]

@@ -6,6 +6,8 @@ import json
 from pathlib import Path
 from typing import Any
 
+from schemas.monitors import AXES, OTHER_MONITORS, SCALES
+
 from pipeline.results.store import check_site, completed_runs, read_run
 from pipeline.show.export.gis import run_geojson, run_gpx
 from pipeline.show.export.layers import geopackage_bytes, geoparquet_bytes, layers_of
@@ -14,7 +16,6 @@ from pipeline.stages.prepare import input_digest
 from pipeline.storage import write_bytes
 from schemas.errors import UsageError
 from schemas.run import RunLog, RunTables, Site
-from schemas.tables import AXES, OTHER_MONITORS, SCALES
 
 SUFFIXES = (".mcap", ".geojson", ".gpx", ".gpkg", ".parquet")
 

@@ -7,6 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 import polars as pl
+from schemas.monitors import ALL_MONITORS
 
 from pipeline.stages.epochs.verdicts import AlarmEpisode, FailureLog
 from pipeline.stages.evidence.evidence import NOTHING
@@ -19,7 +20,7 @@ from schemas.conform import table_of_rows
 from schemas.enums import Suspect, Verdict
 from schemas.frozen import frozen
 from schemas.stages import MatchedEpochs
-from schemas.tables import ALL_MONITORS, Alarms
+from schemas.tables import Alarms
 
 _ODOMETER = "odometer"
 

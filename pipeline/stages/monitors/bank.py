@@ -7,6 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 import polars as pl
+from schemas.monitors import SCALES
 
 from pipeline.stages.epochs.verdicts import (
     DISABLED,
@@ -28,7 +29,6 @@ from schemas.arrays import Bools, Floats, Ints, rows_of
 from schemas.config import Configuration
 from schemas.enums import NotEvaluated
 from schemas.stages import AlignedEpochs
-from schemas.tables import SCALES
 
 FIRST_EPOCH = NotEvaluated.FIRST_EPOCH
 

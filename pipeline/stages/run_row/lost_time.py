@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 import polars as pl
+from schemas.monitors import ALL_MONITORS, MONITORS
 
 from pipeline.stages.epochs.clock import Clock, reaction_of
 from pipeline.stages.epochs.verdicts import Verdicts
@@ -29,7 +30,7 @@ from schemas.enums import (
 )
 from schemas.frozen import frozen
 from schemas.stages import NO_REASON
-from schemas.tables import ALL_MONITORS, MONITORS, Epochs
+from schemas.tables import Epochs
 from schemas.words import lost_words
 
 _LOST_TO = dtypes(Epochs)["lost_to"]

@@ -8,6 +8,7 @@ from dataclasses import asdict, fields
 import numpy as np
 import polars as pl
 import tomli_w
+from schemas.monitors import AXES
 
 from pipeline.one_run import replay
 from pipeline.results.workers import with_progress
@@ -32,7 +33,6 @@ from schemas.config import Configuration, Vehicle
 from schemas.errors import InputError
 from schemas.frozen import frozen
 from schemas.run import RunLog, Site
-from schemas.tables import AXES
 
 _AS_STATED = {"sigma_intercept_m": 0.0, "sigma_slope": 1.0}
 _NO_NOISE = {f"noise_{axis}_m": (0.0, 0.0, 0.0, 0.0) for axis in AXES}

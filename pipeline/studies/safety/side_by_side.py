@@ -11,6 +11,7 @@ from itertools import combinations
 
 import numpy as np
 import polars as pl
+from schemas.monitors import ALL_MONITORS
 
 from pipeline.stages.epochs.clock import Clock, held_s, holds, may_move, nominal_period_s, position_ns, trusted, uptime
 from pipeline.stages.epochs.verdicts import FailureLog, Verdicts, failure_log
@@ -23,7 +24,6 @@ from schemas.arrays import NS_PER_S, Bools
 from schemas.config import Configuration
 from schemas.enums import TRUTH, Judgement, MonitorState, RunStatus, Verdict
 from schemas.frozen import frozen
-from schemas.tables import ALL_MONITORS
 
 Row = dict[str, object]
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataframely as dy
 import numpy as np
 import polars as pl
+from schemas.monitors import SCALES
 
 from pipeline.stages.epochs.clock import crossing_gaps_ns
 from pipeline.stages.judge.judged import JudgedEpochs
@@ -20,7 +21,7 @@ from schemas.config import Configuration, UndetectedConfig
 from schemas.conform import dtypes
 from schemas.enums import BaliseKind
 from schemas.frozen import frozen
-from schemas.tables import SCALES, Epochs, Passages
+from schemas.tables import Epochs, Passages
 
 _OF_EPOCHS = ("undetected_{}_m", "undetected_{}_in_use_m")
 _OF_RANGE = "undetected_range_{}_m"

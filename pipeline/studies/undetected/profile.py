@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import polars as pl
+from schemas.monitors import SCALES
 
 from pipeline.stages.monitored import MonitoredSolution
 from pipeline.studies.undetected.columns import rows_of, rows_of_passages, windows_of
@@ -13,7 +14,6 @@ from pipeline.studies.undetected.steps_and_ramps import largest_of_shape
 from schemas.arrays import NS_PER_S, ints, times_ns
 from schemas.errors import UsageError
 from schemas.frozen import frozen
-from schemas.tables import SCALES
 
 
 @frozen

@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import polars as pl
 import pytest
+from schemas.monitors import BANK_MONITORS
 
 from datasets.experiment.recorded.baseline import Baseline, Onset, baseline_of, numbered, onsets_of, room_of
 from datasets.experiment.recorded.outcome import Injected, injected, outcome_row
@@ -20,7 +21,6 @@ from pipeline import replay
 from schemas.arrays import NS_PER_S, times_ns
 from schemas.config import Configuration
 from schemas.run import RunTables
-from schemas.tables import BANK_MONITORS
 from tests.experiment.recorded.conftest import Journey
 
 ROOT = Path(__file__).parents[3]

@@ -10,6 +10,7 @@ import polars as pl
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from schemas.monitors import SCALES
 
 from pipeline.stages.judge.judge import Judged
 from pipeline.stages.judge.judged import JudgedEpochs
@@ -19,7 +20,7 @@ from pipeline.stages.run_row.summary import SolutionResults, failed_row, summari
 from schemas.config import Configuration, LdsConfig
 from schemas.enums import Evidence, Note, VehicleFigures
 from schemas.run import IngestNotes
-from schemas.tables import CONTRACT_VERSION, SCALES, Runs
+from schemas.tables import CONTRACT_VERSION, Runs
 from schemas.words import Remark
 from tests.arrays_of_table import arrays_of_table
 from tests.tables import NS, alarms, epochs, failures, hazards, passages
