@@ -106,8 +106,9 @@ def _refuse_world_frame(part: DecodedRows) -> None:
     if not source.frame:
         return
     frames = part.frame[source.frame].drop_nulls()
-    # Mostly each is that of the message before.
-    for frame in frames.filter(frames.ne_missing(frames.shift())).unique(maintain_order=True):
+    # Mostly each is that of the first message.
+    others = frames.filter(frames != frames[0]) if len(frames) else frames
+    for frame in pl.concat([frames.head(1), others]).unique(maintain_order=True):
         if is_world_frame(frame):
             (path,) = source.columns["speed_mps"].meta.root_names()
             raise world_frame(source.channel, path, frame)
@@ -188,7 +189,10 @@ def _stamped(frame: pl.DataFrame, source: Source, remarks: list[str]) -> pl.Data
     """Without the messages whose stamp is 0, as of a driver that did not know the time yet."""
     if source.recipe.own:
         return frame
-    unset = frame["t"].to_physical() == 0
+    t_ns = frame["t"].to_physical()
+    if (t_ns.min() or 0) > 0:  # type: ignore[operator]
+        return frame
+    unset = t_ns == 0
     count = int(unset.sum())
     if count <= 1:  # a single 0 may be the start of a clock
         return frame

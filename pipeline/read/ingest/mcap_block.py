@@ -97,7 +97,9 @@ class Messages:
 
     def stretches(self, start: int, end: int) -> Bytes:
         """From one byte to another of each payload, one row each; the payloads must be that long."""
-        return stretches_of(self.data, self.start + start, end - start)
+        if start < 0:
+            return stretches_of(self.data, self.start + start, end - start)
+        return stretches_of(self.data, self.start, end - start, start)
 
     def payload(self, row: int) -> bytes:
         return self.data[self.start[row] :][: self.length[row]].tobytes()
@@ -111,12 +113,12 @@ class Messages:
 Block = dict[int, Messages]  # by channel
 
 
-def stretches_of(data: Bytes, starts: Ints, width: int) -> Bytes:
-    """`width` bytes from each of these offsets on, one row each; the offsets must have been checked."""
+def stretches_of(data: Bytes, starts: Ints, width: int, skip: int = 0) -> Bytes:
+    """`width` bytes `skip` bytes after each of these offsets, one row each; the offsets must have been checked."""
     # As plain bytes: numpy gathers structured values five times slower, field by field.
     if not width:
         return np.empty((len(starts), 0), dtype=np.uint8)
-    every_offset = np.ndarray((len(data) - width + 1,), f"V{width}", data.data, strides=(1,))
+    every_offset = np.ndarray((len(data) - skip - width + 1,), f"V{width}", data.data, skip, (1,))
     return every_offset[starts].view(np.uint8).reshape(-1, width)
 
 
@@ -204,7 +206,7 @@ def _listed(data: Bytes, offset: int, indexes: Sequence[tuple[int, memoryview]])
     tables = _by_channel(indexes)
     if not tables:
         return None
-    log_times, starts = np.concatenate(list(tables.values())).T
+    log_times, starts = np.concatenate([*tables.values()]).T
     order = np.argsort(starts, kind="stable")
     in_order = starts[order]
     first, last = int(in_order[0]), int(in_order[-1])

@@ -209,6 +209,7 @@ def walk_log(
             walk = McapWalk(stream, size, str(path), chunk_limit, unpacked, first_ordinal)
             for block in walk.blocks():
                 streams.add(block, walk.channels)
+                del block  # the next chunk is unpacked into the same memory, which is in the processor's cache
             stream.seek(0)
             return walk, hashlib.file_digest(stream, "sha256").hexdigest() if with_digest else ""
     except DamageError as damage:
@@ -240,7 +241,8 @@ def _frames(
     if "gnss" not in frames and not (partly and frames):
         breaches.append(_no_gnss(logs, left_over))
     refuse(breaches)
-    frames.setdefault("gnss", STREAM_SCHEMAS["gnss"].create_empty())
+    if "gnss" not in frames:
+        frames["gnss"] = STREAM_SCHEMAS["gnss"].create_empty()
     slow_messages = sum(reader.slow_messages for reader in chosen)
     held = _held([*settled], place)
     damage = [text for source in settled if (text := read_damage(dict(source.channel.notes)))]

@@ -10,13 +10,13 @@ import polars as pl
 
 from pipeline.read.ingest.fields import definition_of
 from pipeline.read.ingest.json_columns import JsonDecoder
-from pipeline.read.ingest.layout import Layout, LayoutDecoder, Values
+from pipeline.read.ingest.layout import Layout, Values
+from pipeline.read.ingest.layout_decoder import LayoutDecoder
 from pipeline.read.ingest.mcap_block import Messages
 from pipeline.read.ingest.plan import Source
 from pipeline.read.ingest.protobuf import layout_by
 from pipeline.read.ingest.ros_message import layout_of_cdr
 from pipeline.read.ingest.stamps import LOG_TIME, PUBLISH_TIME
-from schemas.arrays import Ints
 
 ORDINAL = "(ordinal)"  # place of a message in the file
 
@@ -72,18 +72,12 @@ class SourceReader:
 
     def frame(self) -> pl.DataFrame:
         """One row per decoded message in order of the file; what was collected is given up."""
-        places = _concat_parts(self._parts[ORDINAL], pl.Int64())
-        order = None if places.is_sorted() else np.argsort(places.to_numpy(), kind="stable")
-        return pl.DataFrame(
-            {name: _concat_parts(self._parts.pop(name), dtype, order) for name, dtype in self._types.items()}
-        )
+        return pl.DataFrame({name: _concat_parts(self._parts.pop(name), dtype) for name, dtype in self._types.items()})
 
 
-def _concat_parts(parts: list[Values], dtype: pl.DataType, order: Ints | None = None) -> pl.Series:
-    """The parts one after the other, or in this order."""
+def _concat_parts(parts: list[Values], dtype: pl.DataType) -> pl.Series:
+    """The parts one after the other."""
     arrays = [part for part in parts if isinstance(part, np.ndarray)]
     if parts and len(arrays) == len(parts):
-        values = np.concatenate(arrays)
-        return pl.Series(values if order is None else values.take(order), dtype=dtype)
-    whole = pl.concat([pl.Series(dtype=dtype), *(pl.Series(part, dtype=dtype) for part in parts)], rechunk=True)
-    return whole if order is None or whole.null_count() == len(whole) else whole.gather(order)
+        return pl.Series(np.concatenate(arrays), dtype=dtype)
+    return pl.concat([pl.Series(dtype=dtype), *(pl.Series(part, dtype=dtype) for part in parts)], rechunk=True)

@@ -11,8 +11,9 @@ import pytest
 from google.protobuf.descriptor_pb2 import SourceCodeInfo
 from mcap_ros2._dynamic import serialize_dynamic
 
-from pipeline.read.ingest import layout
-from pipeline.read.ingest.layout import Layout, LayoutDecoder
+from pipeline.read.ingest import layout_decoder
+from pipeline.read.ingest.layout import Layout
+from pipeline.read.ingest.layout_decoder import LayoutDecoder
 from pipeline.read.ingest.mcap_block import Messages, Records
 from pipeline.read.ingest.mcap_records import Channel
 from pipeline.read.ingest.protobuf import layout_by
@@ -80,7 +81,7 @@ def test_messages_like_no_other_are_walked_for_themselves(monkeypatch: pytest.Mo
     whole, slow = rows_of(contents, WALK)
     assert [row[2] for row in whole] == [*range(0, 40_000, 800)]
     assert slow == 0
-    monkeypatch.setattr(layout, "_MOST_LAYOUTS", 3)
+    monkeypatch.setattr(layout_decoder, "_MOST_LAYOUTS", 3)
     again, slow = rows_of(contents, WALK)
     assert again == whole
     assert 3 < slow < len(contents)
