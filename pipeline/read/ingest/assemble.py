@@ -20,11 +20,15 @@ from schemas.run import STREAMS, Stream
 
 @frozen
 class DecodedRows:
-    """Fields of all messages of a source, one row per message, with its times and place in the file."""
+    """Fields of all messages of a source, one row per message, with its times and place in the file.
+
+    `speed_frames`: what its messages name as the frame of their speed.
+    """
 
     source: Source
     solution: str | None
     frame: pl.DataFrame
+    speed_frames: Sequence[str]
 
 
 def stream_frames(
@@ -103,15 +107,9 @@ def _rows(
 def _refuse_world_frame(part: DecodedRows) -> None:
     """Raise `InputError` for a component of a velocity in a frame that does not turn with the train."""
     source = part.source
-    if not source.frame:
-        return
-    frames = part.frame[source.frame].drop_nulls()
-    # Mostly each is that of the first message.
-    others = frames.filter(frames != frames[0]) if len(frames) else frames
-    for frame in pl.concat([frames.head(1), others]).unique(maintain_order=True):
-        if is_world_frame(frame):
-            (path,) = source.columns["speed_mps"].meta.root_names()
-            raise world_frame(source.channel, path, frame)
+    for frame in filter(is_world_frame, part.speed_frames):
+        (path,) = source.columns["speed_mps"].meta.root_names()
+        raise world_frame(source.channel, path, frame)
 
 
 def _counted_on(

@@ -101,8 +101,11 @@ def fixed(offset: int, dtype: str) -> Field:
     """A number of fixed width, as numpy names it (`<f8`)."""
     kind = pl.Float64 if dtype[1] == "f" else pl.Int64
 
+    # Nothing is lost where they become numbers of 64 bits.
+    wide = "<f8" if kind is pl.Float64 else dtype if dtype.endswith("8") else "<i8"
+
     def take(blocks: Sequence[Bytes]) -> Values:
-        return np.concatenate([rows.view(dtype)[:, 0] for rows in blocks])
+        return np.concatenate([rows.view(dtype)[:, 0] for rows in blocks], dtype=wide)
 
     return Field(kind, offset, offset + int(dtype[2:]), take)
 

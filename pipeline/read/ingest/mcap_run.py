@@ -231,7 +231,7 @@ def _frames(
     met = [log.walk.channels[channel_id] for log in logs for channel_id in log.streams.readers]
     settled = settle([reader.source for reader in readers], [c.topic for c in met], config, place, partly)
     chosen = [reader for reader in readers if any(reader.source is source for source in settled)]
-    decoded = [DecodedRows(r.source, solution_of(r.source, settled), r.frame()) for r in chosen]
+    decoded = [DecodedRows(r.source, solution_of(r.source, settled), r.frame(), [*r.frames]) for r in chosen]
     used = {source.channel.topic for source in settled}
     unused = {channel.topic: channel.schema_name for channel in met if channel.topic not in used}
     left_over = tuple(f"{topic} ({schema})" if schema else topic for topic, schema in sorted(unused.items()))
@@ -256,8 +256,11 @@ def _merge_files(decoded: Sequence[DecodedRows]) -> list[DecodedRows]:
         source = part.source
         key = (source.channel.topic, source.recipe.stream, id(source.mapping), *source.columns, *source.types)
         before = joined.get(key)
-        frame = part.frame if before is None else pl.concat([before.frame, part.frame]).sort(ORDINAL)
-        joined[key] = replace(part if before is None else before, frame=frame)
+        if before is None:
+            joined[key] = part
+            continue
+        frame = pl.concat([before.frame, part.frame]).sort(ORDINAL)
+        joined[key] = replace(before, frame=frame, speed_frames=[*before.speed_frames, *part.speed_frames])
     return list(joined.values())
 
 

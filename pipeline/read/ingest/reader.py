@@ -38,7 +38,7 @@ def _decoder_of(source: Source, with_publish_time: bool) -> JsonDecoder | Layout
 
 
 class SourceReader:
-    """Collects the fields of one source, block by block."""
+    """Collects the fields of one source, block by block; `frames`: those that its speeds are in, as they were met."""
 
     def __init__(self, source: Source) -> None:
         self.source = source
@@ -46,6 +46,9 @@ class SourceReader:
         self._decoder = _decoder_of(source, PUBLISH_TIME in used)
         self._times = [name for name in (LOG_TIME, PUBLISH_TIME) if name in used]
         self._types = {name: pl.Int64() for name in (ORDINAL, *self._times)} | dict(source.types)
+        self.frames: dict[str, None] = {}
+        if not source.needs_frame:
+            self._types.pop(source.frame, None)
         self._parts: dict[str, list[Values]] = {name: [] for name in self._types}
 
     @property
@@ -69,10 +72,18 @@ class SourceReader:
                 values[PUBLISH_TIME] = heads.publish_time
             for name, parts in self._parts.items():
                 parts.append(values[name])
+            if self.source.frame:
+                self.frames |= dict.fromkeys(_different(pl.Series(values[self.source.frame])))
 
     def frame(self) -> pl.DataFrame:
         """One row per decoded message in order of the file; what was collected is given up."""
         return pl.DataFrame({name: _concat_parts(self._parts.pop(name), dtype) for name, dtype in self._types.items()})
+
+
+def _different(names: pl.Series) -> list[str]:
+    """Each name once, in order; mostly all are as the first."""
+    names = names.drop_nulls()
+    return [*names.head(1), *names.filter(names != names[0]).unique(maintain_order=True)] if len(names) else []
 
 
 def _concat_parts(parts: list[Values], dtype: pl.DataType) -> pl.Series:
