@@ -217,10 +217,10 @@ def _listed(data: Bytes, offset: int, indexes: Sequence[tuple[int, memoryview]])
     ends = in_order + lengths[order] + HEAD_SIZE
     if (
         ends[-1] != len(data)
-        or not np.array_equal(ends[:-1], in_order[1:])
+        or np.count_nonzero(ends[:-1] != in_order[1:])
         or lengths.min() < _FIXED_FIELDS
-        or (heads["opcode"] != int(Opcode.MESSAGE)).any()
-        or not np.array_equal(heads["log_time"], log_times)
+        or np.count_nonzero(heads["opcode"] != int(Opcode.MESSAGE))
+        or np.count_nonzero(heads["log_time"] != log_times)
     ):
         return None
     lengths -= _FIXED_FIELDS
@@ -228,7 +228,7 @@ def _listed(data: Bytes, offset: int, indexes: Sequence[tuple[int, memoryview]])
     at = 0
     for channel, table in tables.items():
         rows = slice(at, at + len(table))
-        if (heads["channel"][rows] != channel).any():
+        if np.count_nonzero(heads["channel"][rows] != channel):
             return None
         parts[channel] = Part(starts[rows], lengths[rows], log_times[rows])
         at += len(table)
@@ -237,12 +237,12 @@ def _listed(data: Bytes, offset: int, indexes: Sequence[tuple[int, memoryview]])
 
 def _by_channel(indexes: Sequence[tuple[int, memoryview]]) -> dict[int, Ints]:
     """Log time and start of the messages of each channel, in the order of their starts."""
-    entries: dict[int, memoryview] = {}
-    for channel, more in indexes:
-        entries[channel] = memoryview(bytes(entries[channel]) + more) if channel in entries else more
-    tables = {channel: np.frombuffer(of_channel, dtype="<i8").reshape(-1, 2) for channel, of_channel in entries.items()}
+    tables: dict[int, Ints] = {}
+    for channel, entries in indexes:
+        table = np.frombuffer(entries, dtype="<i8").reshape(-1, 2)
+        tables[channel] = np.concatenate([tables[channel], table]) if channel in tables else table
     for channel, table in tables.items():
-        if (table[1:, 1] < table[:-1, 1]).any():
+        if np.count_nonzero(table[1:, 1] < table[:-1, 1]):
             tables[channel] = table[np.argsort(table[:, 1], kind="stable")]
     return tables
 
