@@ -156,23 +156,29 @@ def _merged(heads: Heads, parts: Sequence[tuple[_Part, Columns]]) -> Decoded:
     """The rows of all layouts, in order of their messages."""
     if len(parts) == 1 and parts[0][0].layout.count == 1:
         return heads, parts[0][1]
-    counts = np.zeros(len(heads.ordinal), dtype=np.int64)
-    filled = [(part, columns, np.concatenate(part.numbers)) for part, columns in parts if part.layout.count]
-    for part, _, numbers in filled:
-        counts[numbers] = part.layout.count
-    rows = heads.chosen(np.repeat(np.arange(len(counts)), counts))
-    if not filled:
-        return rows, {}
-    first = np.cumsum(counts) - counts
-    places = [np.add.outer(first[numbers], np.arange(part.layout.count)).ravel() for part, _, numbers in filled]
-    order = np.concatenate(places)
-    columns = {
-        path: _at_places(
-            [columns[path] for _, columns, _ in filled], order, _same(path, [part for part, _, _ in filled])
-        )
-        for path in filled[0][0].layout.fields
-    }
+    filled = [(part, columns) for part, columns in parts if part.layout.count]
+    of_parts = [part for part, _ in filled]
+    rows, places = _places(heads, of_parts)
+    columns: dict[str, Values] = {}
+    for path in parts[0][1] if filled else ():
+        columns[path] = _at_places([of_part[path] for _, of_part in filled], places, _same(path, of_parts))
     return rows, columns
+
+
+def _places(heads: Heads, parts: Sequence[_Part]) -> tuple[Heads, Ints]:
+    """The heads of all rows in order, and the places among them of the rows of one layout after the other."""
+    if not parts:
+        return heads.chosen(slice(0)), np.empty(0, dtype=np.int64)
+    numbers = [np.concatenate(part.numbers) for part in parts]
+    counts = np.zeros(len(heads.ordinal), dtype=np.int64)
+    for part, of_part in zip(parts, numbers, strict=True):
+        counts[of_part] = part.layout.count
+    if counts.min() == counts.max() == 1:
+        return heads, np.concatenate(numbers)
+    first = np.cumsum(counts) - counts
+    pairs = zip(parts, numbers, strict=True)
+    places = [np.add.outer(first[of_part], np.arange(part.layout.count)).ravel() for part, of_part in pairs]
+    return heads.chosen(np.repeat(np.arange(len(counts)), counts)), np.concatenate(places)
 
 
 def _same(path: str, parts: Sequence[_Part]) -> pl.Series | None:

@@ -106,7 +106,7 @@ class Messages:
 
     def chosen(self, rows: Ints | Bools | slice) -> Messages:
         """Some of them."""
-        these = np.arange(len(self))[rows]
+        these = np.flatnonzero(rows) if isinstance(rows, np.ndarray) and rows.dtype == np.bool_ else rows
         return Messages(self.records, self.start[these], self.length[these], self.log_time[these], self.before)
 
 
