@@ -20,11 +20,15 @@ from schemas.run import STREAMS, Stream
 
 @frozen
 class DecodedRows:
-    """Fields of all messages of a source, one row per message, with its times and place in the file."""
+    """Fields of all messages of a source, one row per message, with its times and place in the file.
+
+    `speed_frames`: what its messages name as the frame of their speed.
+    """
 
     source: Source
     solution: str | None
     frame: pl.DataFrame
+    speed_frames: Sequence[str]
 
 
 def stream_frames(
@@ -103,14 +107,9 @@ def _rows(
 def _refuse_world_frame(part: DecodedRows) -> None:
     """Raise `InputError` for a component of a velocity in a frame that does not turn with the train."""
     source = part.source
-    if not source.frame:
-        return
-    frames = part.frame[source.frame].drop_nulls()
-    # Mostly each is that of the message before.
-    for frame in frames.filter(frames.ne_missing(frames.shift())).unique(maintain_order=True):
-        if is_world_frame(frame):
-            (path,) = source.columns["speed_mps"].meta.root_names()
-            raise world_frame(source.channel, path, frame)
+    for frame in filter(is_world_frame, part.speed_frames):
+        (path,) = source.columns["speed_mps"].meta.root_names()
+        raise world_frame(source.channel, path, frame)
 
 
 def _counted_on(
@@ -188,7 +187,10 @@ def _stamped(frame: pl.DataFrame, source: Source, remarks: list[str]) -> pl.Data
     """Without the messages whose stamp is 0, as of a driver that did not know the time yet."""
     if source.recipe.own:
         return frame
-    unset = frame["t"].to_physical() == 0
+    t_ns = frame["t"].to_physical()
+    if (t_ns.min() or 0) > 0:  # type: ignore[operator]
+        return frame
+    unset = t_ns == 0
     count = int(unset.sum())
     if count <= 1:  # a single 0 may be the start of a clock
         return frame

@@ -30,8 +30,9 @@ def conform(frame: pl.DataFrame, stream: Stream, place: str, breaches: list[Inpu
     if frame.height == 0 and stream in NEVER_EMPTY:
         breaches.append(InputError("has no rows", place=place, expected="at least one", remedy="Record the stream."))
     result = conform_to(STREAM_SCHEMAS[stream].columns(), frame, place, breaches, DEFAULTS)
-    if stream == "odometer" and {"distance_m", "speed_mps"} <= set(result.columns):
-        neither = result["distance_m"].is_null() & result["speed_mps"].is_null()
+    measured = [result[name] for name in ("distance_m", "speed_mps") if name in result.columns]
+    if stream == "odometer" and len(measured) == 2 and all(series.null_count() for series in measured):
+        neither = measured[0].is_null() & measured[1].is_null()
         if neither.any():
             breaches.append(
                 InputError(
@@ -129,8 +130,10 @@ def _lossless(series: pl.Series, column: dy.Column, target: pl.DataType) -> pl.S
         return one if isinstance(one, str) else one.new_from_index(0, len(series))
     cast = series.cast(target, strict=False)
     if isinstance(column, dy.Enum):
+        if cast.null_count() == series.null_count():
+            return cast
         strange = series.cast(pl.String).filter(cast.is_null() & series.is_not_null()).unique().sort()
-        return ", ".join(repr(value) for value in strange.head(5)) if len(strange) else cast
+        return ", ".join(repr(value) for value in strange.head(5))
     if isinstance(column, dy.Float64):  # of 32 bits and decimal ones fit, of integers not every one is a float
         exact = series.dtype.is_integer() and series.is_between(-_EXACT_INTEGER, _EXACT_INTEGER).all()
         whole = exact or not series.dtype.is_integer()

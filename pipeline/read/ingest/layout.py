@@ -8,7 +8,7 @@ There is no other way to decode: a message like no other is walked for itself.
 from __future__ import annotations
 
 from bisect import bisect_right
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from itertools import chain
 from typing import Any, NamedTuple
@@ -18,14 +18,12 @@ import numpy.typing as npt
 import polars as pl
 import pyarrow as pa
 
-from pipeline.read.ingest.mcap_block import Bytes, Heads, Messages, joined_heads
+from pipeline.read.ingest.mcap_block import Bytes, Heads, Messages
 from pipeline.read.ingest.mcap_records import Channel
 from schemas.arrays import Bools
 from schemas.errors import InputError
 from schemas.frozen import frozen
 
-_MOST_LAYOUTS = 256  # of one channel that are kept
-_LARGEST_KEPT = 1 << 16  # bytes of a message whose layout is kept
 _CHECKED = 64 * 1024  # bytes that are held against a layout at once
 _NEAR = 32  # bytes; what lies nearer is taken together
 _EXACT_INTEGER = 2.0**53
@@ -61,12 +59,16 @@ Decoded = tuple[Heads, Columns]
 
 @frozen
 class Field:
-    """Where a value lies in each message, and how it is taken from these bytes of each message, in rows by block."""
+    """Where a value lies in each message, and how it is taken from these bytes of each message, in rows by block.
+
+    `constant`: the one value of all messages, as a series of one row, where the layout leaves no other.
+    """
 
     kind: type[pl.DataType]
     start: int
     end: int
     take: Callable[[Sequence[Bytes]], Values]
+    constant: pl.Series | None = None
 
     def as_type(self, dtype: pl.DataType) -> Field:
         """The field, if its values are of the kind asked for, or numbers that may be."""
@@ -99,8 +101,11 @@ def fixed(offset: int, dtype: str) -> Field:
     """A number of fixed width, as numpy names it (`<f8`)."""
     kind = pl.Float64 if dtype[1] == "f" else pl.Int64
 
+    # Nothing is lost where they become numbers of 64 bits.
+    wide = "<f8" if kind is pl.Float64 else dtype if dtype.endswith("8") else "<i8"
+
     def take(blocks: Sequence[Bytes]) -> Values:
-        return np.concatenate([rows.view(dtype)[:, 0] for rows in blocks])
+        return np.concatenate([rows.view(dtype)[:, 0] for rows in blocks], dtype=wide)
 
     return Field(kind, offset, offset + int(dtype[2:]), take)
 
@@ -112,15 +117,7 @@ def flag(offset: int) -> Field:
 
 def text(offset: int, length: int) -> Field:
     """A text of known length."""
-
-    def take(blocks: Sequence[Bytes]) -> Values:
-        content = np.concatenate(blocks)
-        flat = content.reshape(-1)
-        if np.array_equal(flat[length:], flat[: len(flat) - length]):  # mostly each is as the one before
-            return _texts(content[:1]).new_from_index(0, len(content))
-        return _texts(content)
-
-    return Field(pl.String, offset, offset + length, take)
+    return Field(pl.String, offset, offset + length, lambda blocks: _texts(np.concatenate(blocks)))
 
 
 def _texts(content: Bytes) -> pl.Series:
@@ -137,19 +134,24 @@ def _texts(content: Bytes) -> pl.Series:
 
 def constant(value: float | str | bool | None, dtype: pl.DataType) -> Field:
     """A field that messages of this layout leave out: its default, or null."""
-    values = pl.Series([value], dtype=dtype, strict=False)
-    if dtype.is_numeric() and value is not None:
-        number = values.to_numpy()
-        return Field(type(dtype), 0, 0, lambda blocks: number.repeat(sum(map(len, blocks))))
-    return Field(type(dtype), 0, 0, lambda blocks: values.new_from_index(0, sum(map(len, blocks))))
+    return _always(pl.Series([value], dtype=dtype, strict=False))
 
 
-class ByteStretch:
-    """Bytes of a message that are taken together, and what they must be under a mask."""
+def _always(value: pl.Series) -> Field:
+    """The value of one row in all messages."""
+    number = value.to_numpy() if value.dtype.is_numeric() and not value.null_count() else None
 
-    def __init__(self, start: int, end: int, mask: Bytes, expected: Bytes) -> None:
-        self.start = start
-        self.end = end
+    def take(blocks: Sequence[Bytes]) -> Values:
+        count = sum(map(len, blocks))
+        return value.new_from_index(0, count) if number is None else number.repeat(count)
+
+    return Field(type(value.dtype), 0, 0, take, value)
+
+
+class BytePattern:
+    """What the bytes of a stretch must be under a mask."""
+
+    def __init__(self, mask: Bytes, expected: Bytes) -> None:
         self._mask = mask
         self._expected = expected
         self._shapes = bool(mask.any())
@@ -175,27 +177,52 @@ class ByteStretch:
         return None
 
 
+class ByteStretch(NamedTuple):
+    """Bytes of a message that are taken together; what they must be, and what they are where all texts are those of
+    the message that the layout was made of.
+    """
+
+    start: int
+    end: int
+    required: BytePattern
+    usual: BytePattern
+
+
 @frozen
 class Layout:
     """Of messages of one length: where they hold the fields, in the order of the rows that they make (mostly one),
-    and the stretches that hold these and all that shapes the layout.
+    and the stretches that hold these and all that shapes the layout. `usual_fields`: as `fields`, of messages with the
+    texts of the one that the layout was made of.
     """
 
     fields: Mapping[str, Sequence[Field]]
+    usual_fields: Mapping[str, Sequence[Field]]
     stretches: Sequence[ByteStretch]
+
+    @property
+    def count(self) -> int:
+        """Rows that each message makes."""
+        return max(map(len, self.fields.values()), default=1)
 
     def rows(self, messages: Messages) -> list[Bytes]:
         """Each stretch of each message."""
         return [messages.stretches(stretch.start, stretch.end) for stretch in self.stretches]
 
+    def are_usual(self, stretches: Sequence[Bytes]) -> bool:
+        """Whether all messages have this layout, and the usual texts."""
+        pairs = zip(self.stretches, stretches, strict=True)
+        return all(stretch.usual.unlike(rows) is None for stretch, rows in pairs)
+
     def of(self, stretches: Sequence[Bytes]) -> Bools | None:
         """Which messages have this layout; None where all have."""
-        found = [stretch.unlike(rows) for stretch, rows in zip(self.stretches, stretches, strict=True)]
+        found = [stretch.required.unlike(rows) for stretch, rows in zip(self.stretches, stretches, strict=True)]
         unlike = [rows for rows in found if rows is not None]
         return ~np.logical_or.reduce(unlike) if unlike else None
 
-    def values(self, blocks: Sequence[Sequence[Bytes]]) -> Columns:
-        """The fields of messages that have this layout, for each row that they make; `blocks`: their stretches."""
+    def values(self, blocks: Sequence[Sequence[Bytes]], usual: bool) -> Columns:
+        """The fields of messages that have this layout, and the `usual` texts, for each row that they make; `blocks`:
+        their stretches.
+        """
         starts = [stretch.start for stretch in self.stretches]
 
         def values(field: Field) -> Values:
@@ -203,12 +230,13 @@ class Layout:
             places = slice(field.start - starts[number], field.end - starts[number])
             return field.values([stretches[number][:, places] for stretches in blocks])
 
-        return {path: _in_turn([*map(values, fields)]) for path, fields in self.fields.items()}
+        fields = self.usual_fields if usual else self.fields
+        return {path: _in_turn([*map(values, of_path)]) for path, of_path in fields.items()}
 
-    def heads_of(self, heads: Heads) -> Heads:
-        """Of the message of each row."""
-        count = max(map(len, self.fields.values()), default=1)
-        return heads if count == 1 else heads.chosen(np.repeat(np.arange(len(heads.ordinal)), count))
+    def constant(self, path: str, usual: bool) -> pl.Series | None:
+        """The value that a field has in every row of such messages; none where it may differ."""
+        fields = (self.usual_fields if usual else self.fields)[path]
+        return fields[0].constant if len(fields) == 1 else None
 
 
 def _in_turn(columns: Sequence[Values]) -> Values:
@@ -220,132 +248,26 @@ def _in_turn(columns: Sequence[Values]) -> Values:
 
 def layout_of(payload: bytes, static: bytearray, fields: Mapping[str, Sequence[Field]]) -> Layout:
     """From one message; `static` masks the bits that shape the layout."""
-    mask = np.frombuffer(static, dtype=np.uint8)
+    required = np.frombuffer(static, dtype=np.uint8)
+    usual = required.copy()
     content = np.frombuffer(payload, dtype=np.uint8)
-    used = mask != 0
+    used = required != 0
     for field in chain.from_iterable(fields.values()):
         used[field.start : field.end] = True
+        if field.kind is pl.String:
+            usual[field.start : field.end] = 0xFF
     places = np.flatnonzero(used)
     stretches = []
     for part in np.split(places, np.flatnonzero(np.diff(places) > _NEAR) + 1):
         start, end = (int(part[0]), int(part[-1]) + 1) if len(part) else (0, 0)
-        stretches.append(ByteStretch(start, end, mask[start:end], content[start:end]))
-    return Layout(fields, stretches)
+        patterns = (BytePattern(mask[start:end], content[start:end]) for mask in (required, usual))
+        stretches.append(ByteStretch(start, end, *patterns))
+    usual_fields = {path: [_usual(field, content) for field in of_path] for path, of_path in fields.items()}
+    return Layout(fields, usual_fields, stretches)
 
 
-def _by_length(messages: Messages) -> Iterator[tuple[int, Messages]]:
-    """The messages of each length, in order of the file."""
-    longest = messages.longest
-    if longest == messages.length.min():
-        yield longest, messages
-        return
-    # As narrow numbers: numpy sorts those of 16 bits in one pass.
-    order = np.argsort(messages.length.astype(np.min_scalar_type(longest)), kind="stable")
-    lengths = messages.length[order]
-    for rows in np.split(order, np.flatnonzero(np.diff(lengths)) + 1):
-        yield int(messages.length[rows[0]]), messages.chosen(rows)
-
-
-class _Waiting(NamedTuple):
-    """A layout, and what waits to be decoded of the messages that have it, block by block."""
-
-    layout: Layout
-    heads: list[Heads]
-    stretches: list[list[Bytes]]
-
-    def taken(self) -> tuple[Layout, Heads, list[list[Bytes]]]:
-        """All of it, and it waits no more."""
-        heads, stretches = joined_heads(self.heads), [*self.stretches]
-        self.heads.clear()
-        self.stretches.clear()
-        return self.layout, heads, stretches
-
-
-class LayoutDecoder:
-    """Decodes the messages of a channel by their layouts, which it learns as they come.
-
-    What the fields and the layout need is taken of each block while that is in the processor's cache, and decoded when
-    somebody asks. `slow_messages`: those whose layout was not kept; `waiting`: bytes that wait to be decoded.
-    Raises `InputError` for a message that cannot be decoded.
-    """
-
-    def __init__(self, channel: Channel, walk: Callable[[bytes], Layout], with_publish_time: bool = False) -> None:
-        self.slow_messages = 0
-        self.waiting = 0
-        self._channel = channel
-        self._walk = walk
-        self._with_publish_time = with_publish_time
-        self._layouts: dict[int, list[_Waiting]] = {}
-        self._kept = 0
-        self._alone: list[Decoded] = []
-
-    def add(self, messages: Messages) -> None:
-        """Take what is needed of all messages."""
-        for length, alike in _by_length(messages):
-            self._by_layout(alike, self._layouts.setdefault(length, []))
-
-    def decoded(self) -> Iterator[Decoded]:
-        """The fields of all messages that wait, of those of one layout together."""
-        alone = self._alone
-        self._alone = []
-        self.waiting = 0
-        yield from alone
-        for known in chain.from_iterable(self._layouts.values()):
-            if known.heads:
-                yield self._decoded(*known.taken())
-
-    def _by_layout(self, left: Messages, known: list[_Waiting]) -> None:
-        tried = 0
-        while len(left):
-            if tried == len(known) and not self._learn(left, known):
-                self._decode_first(left)
-                left = left.chosen(slice(1, None))
-                continue
-            layout = known[tried].layout
-            rows = layout.rows(left)
-            agree = layout.of(rows)
-            if agree is None:
-                self._keep(known[tried], left, rows)
-                return
-            if agree.any():
-                self._keep(known[tried], left.chosen(agree), [stretch[agree] for stretch in rows])
-            left = left.chosen(~agree)
-            tried += 1
-
-    def _keep(self, known: _Waiting, messages: Messages, rows: list[Bytes]) -> None:
-        heads = messages.heads(self._with_publish_time)
-        known.heads.append(heads)
-        known.stretches.append(rows)
-        self.waiting += sum(part.nbytes for part in (*heads, *rows) if part is not None)
-
-    def _learn(self, messages: Messages, known: list[_Waiting]) -> bool:
-        """Whether the layout of the first message is known from now on."""
-        if self._kept >= _MOST_LAYOUTS or messages.length[0] > _LARGEST_KEPT:
-            return False
-        known.append(_Waiting(self._layout_of_first(messages), [], []))
-        self._kept += 1
-        return True
-
-    def _decode_first(self, messages: Messages) -> None:
-        self.slow_messages += 1
-        first = messages.chosen(slice(1))
-        layout = self._layout_of_first(first)
-        self._alone.append(self._decoded(layout, first.heads(self._with_publish_time), [layout.rows(first)]))
-
-    def _layout_of_first(self, messages: Messages) -> Layout:
-        try:
-            return self._walk(messages.payload(0))
-        except UndecodableError as error:
-            raise undecodable(self._channel, messages.log_time[0], error) from None
-
-    def _decoded(self, layout: Layout, heads: Heads, blocks: Sequence[Sequence[Bytes]]) -> Decoded:
-        try:
-            return layout.heads_of(heads), layout.values(blocks)
-        except UndecodableError as error:
-            if len(heads.ordinal) == 1:
-                raise undecodable(self._channel, heads.log_time[0], error) from None
-        stretches = [np.concatenate(of_blocks) for of_blocks in zip(*blocks, strict=True)]
-        for row in range(len(heads.ordinal)):  # one of them cannot be decoded
-            this = slice(row, row + 1)
-            self._decoded(layout, heads.chosen(this), [[stretch[this] for stretch in stretches]])
-        raise AssertionError("messages that can be decoded one by one cannot be decoded together")
+def _usual(field: Field, content: Bytes) -> Field:
+    """The field where its text is that of a message."""
+    if field.kind is not pl.String or field.constant is not None:
+        return field
+    return _always(pl.Series(field.take([content[None, field.start : field.end]])))

@@ -97,26 +97,28 @@ class Messages:
 
     def stretches(self, start: int, end: int) -> Bytes:
         """From one byte to another of each payload, one row each; the payloads must be that long."""
-        return stretches_of(self.data, self.start + start, end - start)
+        if start < 0:
+            return stretches_of(self.data, self.start + start, end - start)
+        return stretches_of(self.data, self.start, end - start, start)
 
     def payload(self, row: int) -> bytes:
         return self.data[self.start[row] :][: self.length[row]].tobytes()
 
     def chosen(self, rows: Ints | Bools | slice) -> Messages:
         """Some of them."""
-        these = np.arange(len(self))[rows]
+        these = np.flatnonzero(rows) if isinstance(rows, np.ndarray) and rows.dtype == np.bool_ else rows
         return Messages(self.records, self.start[these], self.length[these], self.log_time[these], self.before)
 
 
 Block = dict[int, Messages]  # by channel
 
 
-def stretches_of(data: Bytes, starts: Ints, width: int) -> Bytes:
-    """`width` bytes from each of these offsets on, one row each; the offsets must have been checked."""
+def stretches_of(data: Bytes, starts: Ints, width: int, skip: int = 0) -> Bytes:
+    """`width` bytes `skip` bytes after each of these offsets, one row each; the offsets must have been checked."""
     # As plain bytes: numpy gathers structured values five times slower, field by field.
     if not width:
         return np.empty((len(starts), 0), dtype=np.uint8)
-    every_offset = np.ndarray((len(data) - width + 1,), f"V{width}", data.data, strides=(1,))
+    every_offset = np.ndarray((len(data) - skip - width + 1,), f"V{width}", data.data, skip, (1,))
     return every_offset[starts].view(np.uint8).reshape(-1, width)
 
 
@@ -204,7 +206,7 @@ def _listed(data: Bytes, offset: int, indexes: Sequence[tuple[int, memoryview]])
     tables = _by_channel(indexes)
     if not tables:
         return None
-    log_times, starts = np.concatenate(list(tables.values())).T
+    log_times, starts = np.concatenate([*tables.values()]).T
     order = np.argsort(starts, kind="stable")
     in_order = starts[order]
     first, last = int(in_order[0]), int(in_order[-1])
@@ -215,10 +217,10 @@ def _listed(data: Bytes, offset: int, indexes: Sequence[tuple[int, memoryview]])
     ends = in_order + lengths[order] + HEAD_SIZE
     if (
         ends[-1] != len(data)
-        or not np.array_equal(ends[:-1], in_order[1:])
+        or np.count_nonzero(ends[:-1] != in_order[1:])
         or lengths.min() < _FIXED_FIELDS
-        or (heads["opcode"] != int(Opcode.MESSAGE)).any()
-        or not np.array_equal(heads["log_time"], log_times)
+        or np.count_nonzero(heads["opcode"] != int(Opcode.MESSAGE))
+        or np.count_nonzero(heads["log_time"] != log_times)
     ):
         return None
     lengths -= _FIXED_FIELDS
@@ -226,7 +228,7 @@ def _listed(data: Bytes, offset: int, indexes: Sequence[tuple[int, memoryview]])
     at = 0
     for channel, table in tables.items():
         rows = slice(at, at + len(table))
-        if (heads["channel"][rows] != channel).any():
+        if np.count_nonzero(heads["channel"][rows] != channel):
             return None
         parts[channel] = Part(starts[rows], lengths[rows], log_times[rows])
         at += len(table)
@@ -235,12 +237,12 @@ def _listed(data: Bytes, offset: int, indexes: Sequence[tuple[int, memoryview]])
 
 def _by_channel(indexes: Sequence[tuple[int, memoryview]]) -> dict[int, Ints]:
     """Log time and start of the messages of each channel, in the order of their starts."""
-    entries: dict[int, memoryview] = {}
-    for channel, more in indexes:
-        entries[channel] = memoryview(bytes(entries[channel]) + more) if channel in entries else more
-    tables = {channel: np.frombuffer(of_channel, dtype="<i8").reshape(-1, 2) for channel, of_channel in entries.items()}
+    tables: dict[int, Ints] = {}
+    for channel, entries in indexes:
+        table = np.frombuffer(entries, dtype="<i8").reshape(-1, 2)
+        tables[channel] = np.concatenate([tables[channel], table]) if channel in tables else table
     for channel, table in tables.items():
-        if (table[1:, 1] < table[:-1, 1]).any():
+        if np.count_nonzero(table[1:, 1] < table[:-1, 1]):
             tables[channel] = table[np.argsort(table[:, 1], kind="stable")]
     return tables
 

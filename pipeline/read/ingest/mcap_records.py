@@ -59,6 +59,7 @@ class Channel:
 
 
 Record = TypeVar("Record", bound=McapRecord)
+_U16, _U32, _U64 = Struct("<H"), Struct("<I"), Struct("<Q")
 _INDEX_HEAD = Struct("<HI")
 _INDEX_ENTRY_SIZE = 16
 _LARGE = 16 * 1024  # bytes
@@ -77,6 +78,20 @@ class _Stream(ReadDataStream):
             raise EndOfFile
         self._count += length
         return content if length > _LARGE else bytes(content)
+
+    def _number(self, kind: Struct) -> int:
+        value: int = kind.unpack_from(self._record, self._count)[0]
+        self._count += kind.size
+        return value
+
+    def read2(self) -> int:
+        return self._number(_U16)
+
+    def read4(self) -> int:
+        return self._number(_U32)
+
+    def read8(self) -> int:
+        return self._number(_U64)
 
 
 def parse(kind: type[Record], body: bytes, offset: int) -> Record:

@@ -209,6 +209,7 @@ def walk_log(
             walk = McapWalk(stream, size, str(path), chunk_limit, unpacked, first_ordinal)
             for block in walk.blocks():
                 streams.add(block, walk.channels)
+                del block  # the next chunk is unpacked into the same memory, which is in the processor's cache
             stream.seek(0)
             return walk, hashlib.file_digest(stream, "sha256").hexdigest() if with_digest else ""
     except DamageError as damage:
@@ -230,7 +231,7 @@ def _frames(
     met = [log.walk.channels[channel_id] for log in logs for channel_id in log.streams.readers]
     settled = settle([reader.source for reader in readers], [c.topic for c in met], config, place, partly)
     chosen = [reader for reader in readers if any(reader.source is source for source in settled)]
-    decoded = [DecodedRows(r.source, solution_of(r.source, settled), r.frame()) for r in chosen]
+    decoded = [DecodedRows(r.source, solution_of(r.source, settled), r.frame(), [*r.frames]) for r in chosen]
     used = {source.channel.topic for source in settled}
     unused = {channel.topic: channel.schema_name for channel in met if channel.topic not in used}
     left_over = tuple(f"{topic} ({schema})" if schema else topic for topic, schema in sorted(unused.items()))
@@ -240,7 +241,8 @@ def _frames(
     if "gnss" not in frames and not (partly and frames):
         breaches.append(_no_gnss(logs, left_over))
     refuse(breaches)
-    frames.setdefault("gnss", STREAM_SCHEMAS["gnss"].create_empty())
+    if "gnss" not in frames:
+        frames["gnss"] = STREAM_SCHEMAS["gnss"].create_empty()
     slow_messages = sum(reader.slow_messages for reader in chosen)
     held = _held([*settled], place)
     damage = [text for source in settled if (text := read_damage(dict(source.channel.notes)))]
@@ -254,8 +256,11 @@ def _merge_files(decoded: Sequence[DecodedRows]) -> list[DecodedRows]:
         source = part.source
         key = (source.channel.topic, source.recipe.stream, id(source.mapping), *source.columns, *source.types)
         before = joined.get(key)
-        frame = part.frame if before is None else pl.concat([before.frame, part.frame]).sort(ORDINAL)
-        joined[key] = replace(part if before is None else before, frame=frame)
+        if before is None:
+            joined[key] = part
+            continue
+        frame = pl.concat([before.frame, part.frame]).sort(ORDINAL)
+        joined[key] = replace(before, frame=frame, speed_frames=[*before.speed_frames, *part.speed_frames])
     return list(joined.values())
 
 

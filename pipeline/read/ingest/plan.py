@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Collection, Iterable, Mapping, Sequence
+from itertools import chain
 
 import polars as pl
 
@@ -61,6 +62,12 @@ class Source:
     doubtful: Mapping[str, str]
     implicit: Sequence[str]
     frame: str = ""
+
+    @property
+    def needs_frame(self) -> bool:
+        """Whether the field that names the frame of a speed makes a column, too."""
+        paths = chain.from_iterable(column.meta.root_names() for column in self.columns.values())
+        return self.frame in (*paths, *self.recipe.key)
 
     @property
     def dropped(self) -> bool:

@@ -10,13 +10,13 @@ import polars as pl
 
 from pipeline.read.ingest.fields import definition_of
 from pipeline.read.ingest.json_columns import JsonDecoder
-from pipeline.read.ingest.layout import Layout, LayoutDecoder, Values
+from pipeline.read.ingest.layout import Layout, Values
+from pipeline.read.ingest.layout_decoder import LayoutDecoder
 from pipeline.read.ingest.mcap_block import Messages
 from pipeline.read.ingest.plan import Source
 from pipeline.read.ingest.protobuf import layout_by
 from pipeline.read.ingest.ros_message import layout_of_cdr
 from pipeline.read.ingest.stamps import LOG_TIME, PUBLISH_TIME
-from schemas.arrays import Ints
 
 ORDINAL = "(ordinal)"  # place of a message in the file
 
@@ -38,7 +38,7 @@ def _decoder_of(source: Source, with_publish_time: bool) -> JsonDecoder | Layout
 
 
 class SourceReader:
-    """Collects the fields of one source, block by block."""
+    """Collects the fields of one source, block by block; `frames`: those that its speeds are in, as they were met."""
 
     def __init__(self, source: Source) -> None:
         self.source = source
@@ -46,6 +46,9 @@ class SourceReader:
         self._decoder = _decoder_of(source, PUBLISH_TIME in used)
         self._times = [name for name in (LOG_TIME, PUBLISH_TIME) if name in used]
         self._types = {name: pl.Int64() for name in (ORDINAL, *self._times)} | dict(source.types)
+        self.frames: dict[str, None] = {}
+        if not source.needs_frame:
+            self._types.pop(source.frame, None)
         self._parts: dict[str, list[Values]] = {name: [] for name in self._types}
 
     @property
@@ -69,21 +72,23 @@ class SourceReader:
                 values[PUBLISH_TIME] = heads.publish_time
             for name, parts in self._parts.items():
                 parts.append(values[name])
+            if self.source.frame:
+                self.frames |= dict.fromkeys(_different(pl.Series(values[self.source.frame])))
 
     def frame(self) -> pl.DataFrame:
         """One row per decoded message in order of the file; what was collected is given up."""
-        places = _concat_parts(self._parts[ORDINAL], pl.Int64())
-        order = None if places.is_sorted() else np.argsort(places.to_numpy(), kind="stable")
-        return pl.DataFrame(
-            {name: _concat_parts(self._parts.pop(name), dtype, order) for name, dtype in self._types.items()}
-        )
+        return pl.DataFrame({name: _concat_parts(self._parts.pop(name), dtype) for name, dtype in self._types.items()})
 
 
-def _concat_parts(parts: list[Values], dtype: pl.DataType, order: Ints | None = None) -> pl.Series:
-    """The parts one after the other, or in this order."""
+def _different(names: pl.Series) -> list[str]:
+    """Each name once, in order; mostly all are as the first."""
+    names = names.drop_nulls()
+    return [*names.head(1), *names.filter(names != names[0]).unique(maintain_order=True)] if len(names) else []
+
+
+def _concat_parts(parts: list[Values], dtype: pl.DataType) -> pl.Series:
+    """The parts one after the other."""
     arrays = [part for part in parts if isinstance(part, np.ndarray)]
     if parts and len(arrays) == len(parts):
-        values = np.concatenate(arrays)
-        return pl.Series(values if order is None else values.take(order), dtype=dtype)
-    whole = pl.concat([pl.Series(dtype=dtype), *(pl.Series(part, dtype=dtype) for part in parts)], rechunk=True)
-    return whole if order is None or whole.null_count() == len(whole) else whole.gather(order)
+        return pl.Series(np.concatenate(arrays), dtype=dtype)
+    return pl.concat([pl.Series(dtype=dtype), *(pl.Series(part, dtype=dtype) for part in parts)], rechunk=True)

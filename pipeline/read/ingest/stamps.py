@@ -50,15 +50,15 @@ class TimeSource:
         Raises ValueError where the nanoseconds of a stamp make a second or more: it contradicts itself.
         """
         counted = self._nanoseconds(frame).alias(name)
-        return utc_of(counted + _EPOCHS_NS[self.epoch], self.scale)
+        epoch_ns = _EPOCHS_NS[self.epoch]
+        return utc_of(counted + epoch_ns if epoch_ns else counted, self.scale)
 
     def _nanoseconds(self, frame: pl.DataFrame) -> pl.Series:
         first = frame[self.fields[0]]
         if len(self.fields) == 2:
             rest = frame[self.fields[1]]
-            wrong = ~rest.is_between(0, NS_PER_S - 1).fill_null(True)
-            if wrong.any():
-                row = int(wrong.arg_max() or 0)
+            if not _all_between(rest, 0, NS_PER_S - 1):
+                row = int((~rest.is_between(0, NS_PER_S - 1).fill_null(True)).arg_max() or 0)
                 raise ValueError(f"{rest[row]} nanoseconds beside whole seconds in message {row} of the topic")
             return within(first, NS_PER_S) * NS_PER_S + rest
         dtype = self.types.get(self.fields[0], pl.Int64())
@@ -100,7 +100,16 @@ def day_is_unclear(first: pl.Series, second: pl.Series) -> bool:
 
 def within(counts: pl.Series, unit_ns: int) -> pl.Series:
     """The counts of a unit since an epoch, null before it and after `LATEST_NS`: nothing then overflows 64 bits."""
-    return counts.set(~counts.is_between(0, LATEST_NS // max(unit_ns, 1)), None)
+    most = LATEST_NS // max(unit_ns, 1)
+    return counts if _all_between(counts, 0, most) else counts.set(~counts.is_between(0, most), None)
+
+
+def _all_between(counts: pl.Series, least: int, most: int) -> bool:
+    """Whether no number is outside of both; nulls are fine."""
+    if counts.dtype.is_float():  # their extremes pass over NaN
+        return bool(counts.is_between(least, most).all())
+    low = counts.min()
+    return low is None or bool(least <= low and counts.max() <= most)  # type: ignore[operator]
 
 
 def stamp_parts(fields: Mapping[str, str], path: str) -> tuple[str, ...]:

@@ -21,7 +21,8 @@ from pipeline.make.receivers import gather
 from pipeline.read.ingest import mcap_block, read_run
 from pipeline.read.ingest.correct import corrected
 from pipeline.read.ingest.describe import describe_log
-from pipeline.read.ingest.layout import LayoutDecoder, UndecodableError, constant, fixed, layout_of
+from pipeline.read.ingest.layout import UndecodableError, constant, fixed, layout_of
+from pipeline.read.ingest.layout_decoder import LayoutDecoder
 from pipeline.read.ingest.mcap_records import Channel
 from pipeline.read.ingest.protobuf import layout_by
 from pipeline.read.ingest.ros_message import DefinitionError, Member, RosWalk, parse_definitions

@@ -11,8 +11,9 @@ import pytest
 from google.protobuf.descriptor_pb2 import SourceCodeInfo
 from mcap_ros2._dynamic import serialize_dynamic
 
-from pipeline.read.ingest import layout
-from pipeline.read.ingest.layout import Layout, LayoutDecoder
+from pipeline.read.ingest import layout_decoder
+from pipeline.read.ingest.layout import Layout
+from pipeline.read.ingest.layout_decoder import LayoutDecoder
 from pipeline.read.ingest.mcap_block import Messages, Records
 from pipeline.read.ingest.mcap_records import Channel
 from pipeline.read.ingest.protobuf import layout_by
@@ -75,12 +76,34 @@ def test_a_protobuf_message_that_does_not_fit_is_named(content: bytes, reason: s
         rows_of([places([1, 2], [3], comment="e"), content], WALK)
 
 
+def test_texts_of_one_length_that_change() -> None:
+    """Always the same, another from some message on, and another in each message, beside messages of other layouts."""
+    for comments in (["a"] * 6, ["a"] * 3 + ["b"] * 3, [*"abcdef"], ["a", "bc"] * 3, ["a", "", "é", "bc", "a", "d"]):
+        contents = [places([1, number * 100], [number], comment=comment) for number, comment in enumerate(comments)]
+        rows, slow = rows_of(contents, WALK)
+        assert rows == [(number, comment, number * 100, float(number)) for number, comment in enumerate(comments)]
+        assert slow == 0
+
+
+def test_a_text_that_differs_in_a_later_block_alone() -> None:
+    decoder = LayoutDecoder(CHANNEL, WALK)
+    decoded = []
+    for comment in "aabba":
+        content = places([1, 2], [3], comment=comment)
+        records = Records([np.frombuffer(content, dtype=np.uint8)])
+        decoder.add(Messages(records, np.array([0]), np.array([len(content)]), np.array([7])))
+        if comment == "a":
+            ((_, columns),) = decoder.decoded()
+            decoded.append([*columns["location[0].leading_comments"]])
+    assert decoded == [["a"], ["a"], ["b", "b", "a"]]
+
+
 def test_messages_like_no_other_are_walked_for_themselves(monkeypatch: pytest.MonkeyPatch) -> None:
     contents = [places([1, number], [number], comment="c" * (number % 7)) for number in range(0, 40_000, 800)]
     whole, slow = rows_of(contents, WALK)
     assert [row[2] for row in whole] == [*range(0, 40_000, 800)]
     assert slow == 0
-    monkeypatch.setattr(layout, "_MOST_LAYOUTS", 3)
+    monkeypatch.setattr(layout_decoder, "_MOST_LAYOUTS", 3)
     again, slow = rows_of(contents, WALK)
     assert again == whole
     assert 3 < slow < len(contents)
