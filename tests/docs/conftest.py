@@ -9,7 +9,6 @@ from typing import Any
 
 import polars as pl
 import pytest
-from schemas.monitors import BANK_MONITORS
 
 from datasets.scenario import RunSpec, Scenario, load_scenario
 from datasets.trial import build_run, build_site, write_run_log, write_site
@@ -18,6 +17,7 @@ from pipeline.campaign.run import write_campaign
 from pipeline.campaign.worker import replay_one
 from pipeline.results.store import write_config
 from schemas.config import Configuration, to_toml
+from schemas.monitors import BANK_MONITORS
 from tests.conftest import Shared
 from tests.docs.blocks import ROOT
 

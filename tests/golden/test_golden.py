@@ -13,7 +13,6 @@ from pathlib import Path
 
 import polars as pl
 import pytest
-from schemas.monitors import BANK_MONITORS, MONITORS
 
 from datasets.motion import build_motion
 from datasets.scenario import Scenario, load_scenario
@@ -28,6 +27,7 @@ from pipeline.show.report import write_report
 from schemas.config import Configuration, Vehicle
 from schemas.enums import BaliseKind, Hazard, NotEvaluated, PassageStatus
 from schemas.inputs import BaliseReads
+from schemas.monitors import BANK_MONITORS, MONITORS
 from schemas.run import RunLog, RunTables
 from schemas.tables import TABLES
 

@@ -8,7 +8,6 @@ from pathlib import Path
 
 import polars as pl
 import pytest
-from schemas.monitors import MONITORS, OTHER_MONITORS
 
 from pipeline.stages.monitors.single import WITHOUT_MEMORY
 from schemas.config import Configuration, IngestConfig, Vehicle, digest_of, load_settings, settings_from, to_toml
@@ -16,6 +15,7 @@ from schemas.conform import conform
 from schemas.dictionary import dictionary_frame, dictionary_markdown
 from schemas.errors import BaliseError, ConfigError, InputError
 from schemas.inputs import SITE_SCHEMAS, STREAM_SCHEMAS
+from schemas.monitors import MONITORS, OTHER_MONITORS
 from schemas.project import LogEntry
 from schemas.run import RECORDED_STREAMS, STREAMS, RunLog
 from schemas.tables import TABLES, Alarms, Epochs

@@ -6,8 +6,6 @@ import json
 from pathlib import Path
 from typing import Any
 
-from schemas.monitors import AXES, OTHER_MONITORS, SCALES
-
 from pipeline.results.store import check_site, completed_runs, read_run
 from pipeline.show.export.gis import run_geojson, run_gpx
 from pipeline.show.export.layers import geopackage_bytes, geoparquet_bytes, layers_of
@@ -15,6 +13,7 @@ from pipeline.show.export.mcap_file import PositionMessage, run_topics, write_to
 from pipeline.stages.prepare import input_digest
 from pipeline.storage import write_bytes
 from schemas.errors import UsageError
+from schemas.monitors import AXES, OTHER_MONITORS, SCALES
 from schemas.run import RunLog, RunTables, Site
 
 SUFFIXES = (".mcap", ".geojson", ".gpx", ".gpkg", ".parquet")

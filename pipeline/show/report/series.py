@@ -6,13 +6,13 @@ from collections.abc import Collection, Sequence
 
 import numpy as np
 import polars as pl
-from schemas.monitors import ALL_MONITORS, MONITORS
 
 from pipeline.show.report.decimate import WHOLE_SERIES, Band, band, detail_rows, kept_rows
 from pipeline.show.report.markup import Json, packed
 from pipeline.stages.epochs.clock import gap_limit_s, nominal_period_s
 from schemas.arrays import Bools, Floats, Ints, floats
 from schemas.enums import Judgement, LdsMode, LdsState, MonitorState
+from schemas.monitors import ALL_MONITORS, MONITORS
 
 SERIES = (
     "speed_mps",

@@ -11,10 +11,10 @@ import polars as pl
 import pytest
 from mcap.reader import make_reader
 from mcap_protobuf.decoder import DecoderFactory
-from schemas.monitors import MONITORS
 
 from pipeline.show.export import export_run
 from schemas.errors import UsageError
+from schemas.monitors import MONITORS
 from tests.show.export.conftest import Result
 
 

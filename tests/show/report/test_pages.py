@@ -13,7 +13,6 @@ from typing import Any
 import numpy as np
 import polars as pl
 import pytest
-from schemas.monitors import MONITORS
 from typer.testing import CliRunner
 
 from cli import app
@@ -25,6 +24,7 @@ from pipeline.show.report.campaign_page import RUN_COLUMNS
 from pipeline.show.report.route_found import found_route
 from schemas.campaign import STANFORD
 from schemas.errors import UsageError
+from schemas.monitors import MONITORS
 from schemas.run import RunTables, Site
 from tests.show.report.conftest import FAILED, REASON, RUNS
 
