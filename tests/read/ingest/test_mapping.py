@@ -25,6 +25,8 @@ from tests.read.ingest import samples
 
 STAMP = {"sec": 1_700_000_000, "nanosec": 250_000_000}
 STAMP_NS = 1_700_000_000_250_000_000
+# Logged later than stamped: a wrong path of a stamp, for which the log time stands in, does not pass.
+LOG_NS = STAMP_NS + 7_000_000_000
 HEADER_TEXT = (
     "MSG: std_msgs/Header\nbuiltin_interfaces/Time stamp\nstring frame_id\n"
     "================\nMSG: builtin_interfaces/Time\nint32 sec\nuint32 nanosec\n"
@@ -43,7 +45,7 @@ def json_log(tmp_path, topics: dict[str, list[dict]], schema: str = "acme.Thing"
         schema_id = writer.register_schema((of or {}).get(topic, schema), "jsonschema", b"{}")
         channel_id = writer.register_channel(topic, "json", schema_id)
         for number, message in enumerate(messages):
-            writer.add_message(channel_id, STAMP_NS + number, json.dumps(message).encode(), STAMP_NS + 1000 + number)
+            writer.add_message(channel_id, LOG_NS + number, json.dumps(message).encode(), LOG_NS + 1000 + number)
     writer.finish()
     return samples.save(tmp_path, stream.getvalue())
 
@@ -57,7 +59,7 @@ def ros_log(tmp_path, *topics: tuple[str, str, str, list[dict]]):
         channel_id = writer.register_channel(topic, "cdr", schema_id)
         encode = serialize_dynamic(name, text)[name]
         for number, message in enumerate(messages):
-            writer.add_message(channel_id, STAMP_NS + number, encode(message), STAMP_NS)
+            writer.add_message(channel_id, LOG_NS + number, encode(message), LOG_NS)
     writer.finish()
     return samples.save(tmp_path, stream.getvalue())
 
@@ -94,7 +96,7 @@ def test_fields_factors_codes_and_gps_time(tmp_path):
     assert found["t"] == round((since_1980 + 1_400_000_000.5 - 18) * 1e9)
     odometer = read_run(path, config(gnss=gnss, odometer=speed)).odometer
     assert odometer["speed_mps"].to_list() == [36.0 * (1 / 3.6)]
-    assert odometer["t"].to_physical().to_list() == [STAMP_NS + 1000]
+    assert odometer["t"].to_physical().to_list() == [LOG_NS + 1000]
 
 
 @pytest.mark.parametrize(
@@ -113,7 +115,7 @@ def test_forms_of_stamps(tmp_path, stamp, expected):
     path = json_log(tmp_path, {"/acme": [{"lat": 50.5, "lon": 4.5, "when": stamp}]})
     fields = {"latitude_deg": "lat", "longitude_deg": "lon"}
     assert row(path, config(gnss={"topic": "/acme", "fields": fields, "time": "field:when"}))["t"] == expected
-    assert row(path, config(gnss={"topic": "/acme", "fields": fields}))["t"] == STAMP_NS
+    assert row(path, config(gnss={"topic": "/acme", "fields": fields}))["t"] == LOG_NS
     assert row(path, config(gnss={"topic": "/acme", "fields": {**fields, "t": "when"}}))["t"] == expected
 
 
@@ -122,7 +124,7 @@ def test_what_is_no_stamp_is_no_time(tmp_path, stamp, kind):
     place = {"lat": 50.5, "lon": 4.5}
     path = json_log(tmp_path, {"/acme": [{**place, "stamp": stamp}, {**place, "stamp": stamp}]})
     gnss = {"topic": "/acme", "fields": {"latitude_deg": "lat", "longitude_deg": "lon"}}
-    assert row(path, config(gnss=gnss))["t"] == STAMP_NS
+    assert row(path, config(gnss=gnss))["t"] == LOG_NS
     with pytest.raises(InputError, match=f"/acme: field stamp: is not a time; found {kind}"):
         read_run(path, config(gnss={**gnss, "time": "field:stamp"}))
 
