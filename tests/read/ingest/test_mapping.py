@@ -264,7 +264,8 @@ def test_septentrio(tmp_path):
         {**head(1100), "mode": 0, "error": 1, "latitude": -2e10, "longitude": -2e10, "height": -2e10, "vn": -2e10,
          "ve": -2e10, "vu": -2e10, "nr_sv": 255, "reference_id": 65535, "mean_corr_age": 65535},
     ]  # fmt: skip
-    covariances = [{**head(1000), "cov_latlat": 4.0, "cov_lonlon": 1.0, "cov_hgthgt": 9.0, "cov_latlon": 0.5}]
+    horizontal = {"cov_latlat": 4.0, "cov_lonlon": 1.0, "cov_latlon": 0.5}
+    covariances = [{**head(1000), **horizontal, "cov_hgthgt": 9.0, "cov_lathgt": 0.25, "cov_lonhgt": -0.75}]
     name = "septentrio_gnss_driver/msg/"
     path = ros_log(
         tmp_path,
@@ -275,6 +276,7 @@ def test_septentrio(tmp_path):
     assert first["t"] == STAMP_NS
     assert first["latitude_deg"] == pytest.approx(50.5, abs=1e-12)
     assert (first["cov_nn_m2"], first["cov_ee_m2"], first["cov_en_m2"], first["cov_uu_m2"]) == (4.0, 1.0, 0.5, 9.0)
+    assert (first["cov_nu_m2"], first["cov_eu_m2"]) == (0.25, -0.75)
     assert (first["vel_e_mps"], first["vel_n_mps"], first["vel_u_mps"]) == (2.5, 1.5, -0.5)
     assert (first["fix"], first["satellites"], first["sbas_prn"], first["sbas_age_s"]) == ("sbas", 9, 123, 2.5)
     assert first["solution"] == "primary"
