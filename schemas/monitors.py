@@ -46,6 +46,8 @@ ALL_MONITORS: tuple[Monitor, ...] = (
     Monitor("channel", "m", "other", "channel", axis="along", solutions=2),
 )
 """Tables, configuration, pages, exports and dictionary read this tuple; what runs is in `pipeline/stages/monitors`."""
+DRAWINGS: tuple[str, ...] = tuple(dict.fromkeys(monitor.drawing for monitor in ALL_MONITORS))
+"""Drawings of monitors in their order; each has its title in `schemas/words.toml`."""
 BANK_MONITORS: tuple[str, ...] = tuple(monitor.name for monitor in _BANK)
 MONITORS: tuple[str, ...] = tuple(monitor.name for monitor in ALL_MONITORS)
 OTHER_MONITORS: tuple[str, ...] = MONITORS[len(BANK_MONITORS) :]

@@ -17,12 +17,12 @@ from pipeline.campaign.run import write_campaign
 from pipeline.campaign.worker import replay_one
 from pipeline.results.store import write_config
 from schemas.config import Configuration, to_toml
-from schemas.monitors import BANK_MONITORS
+from schemas.monitors import MONITORS
 from tests.conftest import Shared
 from tests.docs.blocks import ROOT
 
 BLIND = ("windows_only_early", "windows_only_late")
-LINK_MONITORS = ("link_order", "link_distance", "along_doppler")
+WITHOUT_INPUT = ("pseudorange", "channel")
 FAULTY = "jump_two"
 RUNS = ("drift_early", FAULTY, "outage_and_slip")
 
@@ -62,7 +62,9 @@ def _fill_asked(folder: Path) -> None:
         write_run_log(build_run(scenario, _spec(scenario, name)), folder / "runs")
     (folder / "runs" / "broken").mkdir()
     (folder / "runs" / "broken" / "gnss.parquet").write_bytes(b"cut off")
-    bank_off = Configuration.model_validate({"monitors": {"disabled": [*BANK_MONITORS, *LINK_MONITORS]}})
+    bank_off = Configuration.model_validate(
+        {"monitors": {"disabled": [name for name in MONITORS if name not in WITHOUT_INPUT]}}
+    )
     _replay(folder, BLIND, bank_off)
     _replay(folder, (*RUNS, "jump_without_odometer", "two_solutions", "broken"), Configuration())
 

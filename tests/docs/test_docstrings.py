@@ -24,10 +24,9 @@ from pipeline.stages.judge.judgement import judge_positions
 from pipeline.stages.judge.train_crossings import crossings_of
 from pipeline.stages.matching.match import find_path
 from pipeline.stages.monitored import monitor_solution
+from pipeline.stages.monitors import pseudorange, single
 from pipeline.stages.monitors.axes import axes_of
 from pipeline.stages.monitors.axis import along_series, run_axis
-from pipeline.stages.monitors.pseudorange import pseudorange_monitor
-from pipeline.stages.monitors.single import WITHOUT_MEMORY, channel_monitor, doppler_monitor
 from pipeline.stages.paths.growth import path_set
 from pipeline.stages.paths.path_steps import path_steps
 from pipeline.stages.prepare import prepare
@@ -38,7 +37,12 @@ from tests.docs.blocks import ROOT
 
 Function = Callable[..., Any]
 SECTIONS = ("Args", "Returns", "Raises", "Source")
-MONITORS = {"along_doppler": doppler_monitor, "channel": channel_monitor, "pseudorange": pseudorange_monitor}
+MONITORS = tuple(
+    function
+    for module in (single, pseudorange)
+    for name, function in vars(module).items()
+    if name.endswith("_monitor") and function.__module__ == module.__name__
+)
 ENTRIES = (
     align,
     learn,
@@ -91,7 +95,7 @@ def with_parameters(functions: Iterator[Function]) -> dict[str, Function]:
     return {name: item for name, item in sorted(named.items()) if inspect.signature(item).parameters}
 
 
-FUNCTIONS = with_parameters(iter((*exported(), *ENTRIES, *MONITORS.values())))
+FUNCTIONS = with_parameters(iter((*exported(), *ENTRIES, *MONITORS)))
 
 
 def sections(function: Function) -> dict[str, list[str]]:
@@ -128,7 +132,7 @@ def test_what_is_returned_and_raised_is_described(name: str) -> None:
 
 
 def test_all_monitors_without_memory_are_asked() -> None:
-    assert MONITORS.keys() == WITHOUT_MEMORY.keys()
+    assert len(MONITORS) == len(single.WITHOUT_MEMORY)
 
 
 def test_a_parameter_that_is_not_described_is_found() -> None:

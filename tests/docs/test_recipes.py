@@ -37,6 +37,23 @@ COLUMN = [
         '        "epochs_on_track": int(epochs.on_track.sum()),\n',
     ),
 ]
+EPOCH_COLUMN = [
+    (
+        TABLES,
+        '    satellites = dy.Int64(nullable=True, min=0, description="satellites used',
+        '    speed_over_ground_mps = real("m/s", "horizontal speed by the GNSS velocity", min=0)\n',
+    ),
+    (
+        "schemas/stages.py",
+        "    hpl_m: Floats\n",
+        '    speed_over_ground_mps: Floats\n    """Horizontal speed by the GNSS velocity [m/s]."""\n',
+    ),
+    (
+        "pipeline/stages/matching/epochs.py",
+        "        hpl_m=fixes.hpl_m,\n",
+        "        speed_over_ground_mps=np.hypot(fixes.vel_e_mps, fixes.vel_n_mps),\n",
+    ),
+]
 STREAM = [
     (
         INPUTS,
@@ -230,6 +247,7 @@ print(json.dumps({
     "drawn": monitor_lines()["other"],
     "series": sorted(name for name in page["series"] if "offside" in name),
     "column": tables.runs["epochs_on_track"].to_list(),
+    "fastest_mps": tables.epochs["speed_over_ground_mps"].max(),
     "acme": read_run(log).gnss.select("latitude_deg", pl.col("fix").cast(pl.String)).rows(),
     "doors": read_run(folder).doors["open"].to_list(),
     "corrected": read_run(folder, corrected.ingest).doors["t"].dt.epoch("s").to_list(),
@@ -261,7 +279,7 @@ def followed(tmp_path_factory: pytest.TempPathFactory) -> dict[str, object]:
     for folder in ("schemas", "pipeline", "datasets"):
         # With what is compiled of it: only what is changed is compiled again.
         shutil.copytree(ROOT / folder, copy / folder)
-    for file, before, text in (*MONITOR, *COLUMN, *STREAM, *MESSAGE, *RULE, *DETECTIONS, *EVIDENCE):
+    for file, before, text in (*MONITOR, *COLUMN, *EPOCH_COLUMN, *STREAM, *MESSAGE, *RULE, *DETECTIONS, *EVIDENCE):
         source = (copy / file).read_text(encoding="utf-8")
         assert source.count(before) == 1, (file, before)
         (copy / file).write_text(source.replace(before, text + before), encoding="utf-8")
@@ -286,6 +304,12 @@ def test_a_monitor_takes_two_files(followed: dict[str, object]) -> None:
 def test_a_column_takes_two_files(followed: dict[str, object]) -> None:
     assert followed["column"] != [0]
     assert len({file for file, _, _ in COLUMN}) == 2
+
+
+def test_a_column_of_epochs_that_the_judge_only_hands_on_takes_three_files(followed: dict[str, object]) -> None:
+    """The train of the trial runs at 30 m/s."""
+    assert followed["fastest_mps"] == pytest.approx(30.0, abs=0.5)
+    assert len({file for file, _, _ in EPOCH_COLUMN}) == 3
 
 
 def test_a_stream_takes_three_files(followed: dict[str, object]) -> None:
@@ -331,6 +355,7 @@ def test_the_dictionary_follows(followed: dict[str, object]) -> None:
     [
         ("monitor", MONITOR),
         ("column", COLUMN),
+        ("column", EPOCH_COLUMN),
         ("input stream", STREAM),
         ("message format", MESSAGE),
         ("rule", RULE),

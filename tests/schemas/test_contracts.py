@@ -15,10 +15,11 @@ from schemas.conform import conform
 from schemas.dictionary import dictionary_frame, dictionary_markdown
 from schemas.errors import BaliseError, ConfigError, InputError
 from schemas.inputs import SITE_SCHEMAS, STREAM_SCHEMAS
-from schemas.monitors import MONITORS, OTHER_MONITORS
+from schemas.monitors import ALL_MONITORS, AXES, MONITORS, OTHER_MONITORS
 from schemas.project import LogEntry
 from schemas.run import RECORDED_STREAMS, STREAMS, RunLog
 from schemas.tables import TABLES, Alarms, Epochs
+from schemas.words import WORDS
 
 ROOT = Path(__file__).parents[2]
 
@@ -46,6 +47,17 @@ def test_monitors_have_the_names_of_the_domain():
     assert {f"{name}_{part}" for name in MONITORS for part in ("value", "threshold", "state", "reason")} <= set(
         Epochs.column_names()
     )
+
+
+def test_a_monitor_named_after_an_axis_sees_that_axis():
+    """Its alarm across the track or in height is called false by a reference alone."""
+    for monitor in ALL_MONITORS:
+        named = monitor.name.split("_")[0]
+        assert monitor.axis == named or named not in AXES, monitor.name
+
+
+def test_every_drawing_of_monitors_has_a_title():
+    assert {f"monitors-{monitor.drawing}" for monitor in ALL_MONITORS} <= set(WORDS["plots"]["run"])
 
 
 def test_every_monitor_that_runs_has_columns():

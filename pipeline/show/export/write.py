@@ -13,7 +13,7 @@ from pipeline.show.export.mcap_file import PositionMessage, run_topics, write_to
 from pipeline.stages.prepare import input_digest
 from pipeline.storage import write_bytes
 from schemas.errors import UsageError
-from schemas.monitors import AXES, OTHER_MONITORS, SCALES
+from schemas.monitors import ALL_MONITORS, DRAWINGS
 from schemas.run import RunLog, RunTables, Site
 
 SUFFIXES = (".mcap", ".geojson", ".gpx", ".gpkg", ".parquet")
@@ -115,8 +115,7 @@ def layout_json(solution: str, with_positions: bool) -> str:
         "RosOut!hazards": {"searchTerms": [], "minLogLevel": 1, "topicToRender": f"/{solution}/hazards"},
         "Plot!position": _plot([f"/{solution}/lds.{name}" for name in ("error_low_m", "error_high_m", "confidence_m")]),
         "Plot!speed": _plot([f"/{solution}/lds.{name}" for name in ("speed_mps", "exposure_s")]),
-        **{f"Plot!{axis}": _monitors(solution, [f"{axis}_{scale}" for scale in SCALES]) for axis in AXES},
-        "Plot!others": _monitors(solution, list(OTHER_MONITORS)),
+        **{f"Plot!{drawing}": _monitors(solution, drawing) for drawing in DRAWINGS},
     }
     left = ["StateTransitions!states", "RosOut!hazards"]
     if with_positions:
@@ -148,7 +147,9 @@ def _states(solution: str) -> Panel:
     return {"paths": paths, "isSynced": True}
 
 
-def _monitors(solution: str, names: list[str]) -> Panel:
+def _monitors(solution: str, drawing: str) -> Panel:
+    """The monitors of one drawing, over their thresholds."""
+    names = [monitor.name for monitor in ALL_MONITORS if monitor.drawing == drawing]
     limits = [{"value": limit, "enabled": True, "timestampMethod": "receiveTime"} for limit in ("1", "-1")]
     panel = _plot([f"/{solution}/monitors.{name}_ratio" for name in names])
     return panel | {"paths": [*panel["paths"], *limits], "minYValue": -3, "maxYValue": 3}

@@ -12,7 +12,7 @@ from pipeline.show.report.markup import Json, packed
 from pipeline.stages.epochs.clock import gap_limit_s, nominal_period_s
 from schemas.arrays import Bools, Floats, Ints, floats
 from schemas.enums import Judgement, LdsMode, LdsState, MonitorState
-from schemas.monitors import ALL_MONITORS, MONITORS
+from schemas.monitors import ALL_MONITORS, DRAWINGS, MONITORS
 
 SERIES = (
     "speed_mps",
@@ -83,10 +83,9 @@ def moments_of(*frames: pl.DataFrame) -> Ints:
 
 def monitor_lines() -> dict[str, list[list[str]]]:
     """Name and label of the lines of each drawing of monitors."""
-    drawings = dict.fromkeys(monitor.drawing for monitor in ALL_MONITORS)
     return {
         drawing: [[monitor.name, monitor.label] for monitor in ALL_MONITORS if monitor.drawing == drawing]
-        for drawing in drawings
+        for drawing in DRAWINGS
     }
 
 

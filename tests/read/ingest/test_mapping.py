@@ -25,6 +25,8 @@ from tests.read.ingest import samples
 
 STAMP = {"sec": 1_700_000_000, "nanosec": 250_000_000}
 STAMP_NS = 1_700_000_000_250_000_000
+# Logged later than stamped: a wrong path of a stamp, for which the log time stands in, does not pass.
+LOG_NS = STAMP_NS + 7_000_000_000
 HEADER_TEXT = (
     "MSG: std_msgs/Header\nbuiltin_interfaces/Time stamp\nstring frame_id\n"
     "================\nMSG: builtin_interfaces/Time\nint32 sec\nuint32 nanosec\n"
@@ -43,7 +45,7 @@ def json_log(tmp_path, topics: dict[str, list[dict]], schema: str = "acme.Thing"
         schema_id = writer.register_schema((of or {}).get(topic, schema), "jsonschema", b"{}")
         channel_id = writer.register_channel(topic, "json", schema_id)
         for number, message in enumerate(messages):
-            writer.add_message(channel_id, STAMP_NS + number, json.dumps(message).encode(), STAMP_NS + 1000 + number)
+            writer.add_message(channel_id, LOG_NS + number, json.dumps(message).encode(), LOG_NS + 1000 + number)
     writer.finish()
     return samples.save(tmp_path, stream.getvalue())
 
@@ -57,7 +59,7 @@ def ros_log(tmp_path, *topics: tuple[str, str, str, list[dict]]):
         channel_id = writer.register_channel(topic, "cdr", schema_id)
         encode = serialize_dynamic(name, text)[name]
         for number, message in enumerate(messages):
-            writer.add_message(channel_id, STAMP_NS + number, encode(message), STAMP_NS)
+            writer.add_message(channel_id, LOG_NS + number, encode(message), LOG_NS)
     writer.finish()
     return samples.save(tmp_path, stream.getvalue())
 
@@ -94,7 +96,7 @@ def test_fields_factors_codes_and_gps_time(tmp_path):
     assert found["t"] == round((since_1980 + 1_400_000_000.5 - 18) * 1e9)
     odometer = read_run(path, config(gnss=gnss, odometer=speed)).odometer
     assert odometer["speed_mps"].to_list() == [36.0 * (1 / 3.6)]
-    assert odometer["t"].to_physical().to_list() == [STAMP_NS + 1000]
+    assert odometer["t"].to_physical().to_list() == [LOG_NS + 1000]
 
 
 @pytest.mark.parametrize(
@@ -113,7 +115,7 @@ def test_forms_of_stamps(tmp_path, stamp, expected):
     path = json_log(tmp_path, {"/acme": [{"lat": 50.5, "lon": 4.5, "when": stamp}]})
     fields = {"latitude_deg": "lat", "longitude_deg": "lon"}
     assert row(path, config(gnss={"topic": "/acme", "fields": fields, "time": "field:when"}))["t"] == expected
-    assert row(path, config(gnss={"topic": "/acme", "fields": fields}))["t"] == STAMP_NS
+    assert row(path, config(gnss={"topic": "/acme", "fields": fields}))["t"] == LOG_NS
     assert row(path, config(gnss={"topic": "/acme", "fields": {**fields, "t": "when"}}))["t"] == expected
 
 
@@ -122,7 +124,7 @@ def test_what_is_no_stamp_is_no_time(tmp_path, stamp, kind):
     place = {"lat": 50.5, "lon": 4.5}
     path = json_log(tmp_path, {"/acme": [{**place, "stamp": stamp}, {**place, "stamp": stamp}]})
     gnss = {"topic": "/acme", "fields": {"latitude_deg": "lat", "longitude_deg": "lon"}}
-    assert row(path, config(gnss=gnss))["t"] == STAMP_NS
+    assert row(path, config(gnss=gnss))["t"] == LOG_NS
     with pytest.raises(InputError, match=f"/acme: field stamp: is not a time; found {kind}"):
         read_run(path, config(gnss={**gnss, "time": "field:stamp"}))
 
@@ -262,7 +264,8 @@ def test_septentrio(tmp_path):
         {**head(1100), "mode": 0, "error": 1, "latitude": -2e10, "longitude": -2e10, "height": -2e10, "vn": -2e10,
          "ve": -2e10, "vu": -2e10, "nr_sv": 255, "reference_id": 65535, "mean_corr_age": 65535},
     ]  # fmt: skip
-    covariances = [{**head(1000), "cov_latlat": 4.0, "cov_lonlon": 1.0, "cov_hgthgt": 9.0, "cov_latlon": 0.5}]
+    horizontal = {"cov_latlat": 4.0, "cov_lonlon": 1.0, "cov_latlon": 0.5}
+    covariances = [{**head(1000), **horizontal, "cov_hgthgt": 9.0, "cov_lathgt": 0.25, "cov_lonhgt": -0.75}]
     name = "septentrio_gnss_driver/msg/"
     path = ros_log(
         tmp_path,
@@ -273,6 +276,7 @@ def test_septentrio(tmp_path):
     assert first["t"] == STAMP_NS
     assert first["latitude_deg"] == pytest.approx(50.5, abs=1e-12)
     assert (first["cov_nn_m2"], first["cov_ee_m2"], first["cov_en_m2"], first["cov_uu_m2"]) == (4.0, 1.0, 0.5, 9.0)
+    assert (first["cov_nu_m2"], first["cov_eu_m2"]) == (0.25, -0.75)
     assert (first["vel_e_mps"], first["vel_n_mps"], first["vel_u_mps"]) == (2.5, 1.5, -0.5)
     assert (first["fix"], first["satellites"], first["sbas_prn"], first["sbas_age_s"]) == ("sbas", 9, 123, 2.5)
     assert first["solution"] == "primary"

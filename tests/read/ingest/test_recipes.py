@@ -4,23 +4,45 @@ from __future__ import annotations
 
 import ast
 import math
+import re
 from pathlib import Path
 
 import pytest
 
 from pipeline.read.ingest import read_run
+from pipeline.read.ingest.recipe import Recipe
 from pipeline.read.ingest.recipes import BY_SCHEMA, OWN_PREFIX
 from schemas.config import IngestConfig
 from tests.read.ingest.test_mapping import HEADER_TEXT, STAMP, STAMP_NS, json_log, ros_log, row
 
 
-def test_every_schema_has_a_test_of_its_messages() -> None:
-    """Its name stands in a test of this folder, or of the receivers."""
+def texts_of_tests() -> set[str]:
+    """All texts in the tests of this folder and of the receivers: names of schemas, definitions, keys of messages."""
     folders = (Path(__file__).parent, Path(__file__).parents[2] / "make" / "receivers")
-    named: set[str] = set()
+    texts: set[str] = set()
     for file in (file for folder in folders for file in folder.glob("*.py")):
         nodes = ast.walk(ast.parse(file.read_text(encoding="utf-8")))
-        named |= {node.value for node in nodes if isinstance(node, ast.Constant) and isinstance(node.value, str)}
+        texts |= {node.value for node in nodes if isinstance(node, ast.Constant) and isinstance(node.value, str)}
+    return texts
+
+
+def fields_of(recipe: Recipe) -> set[str]:
+    """Names of all fields on the paths that a recipe reads."""
+    columns = (path for column in recipe.columns for path in recipe.fields_of(column))
+    paths = [*columns, *recipe.stamps.values(), *recipe.key, *recipe.whole, *recipe.types, recipe.rows]
+    return {name for path in paths for name in re.findall(r"[A-Za-z_]\w*", path)}
+
+
+def test_every_field_of_a_recipe_stands_in_a_message_of_a_test() -> None:
+    """So a field that no driver writes does not pass, whether or not a test asks for its column."""
+    words = {word for text in texts_of_tests() for word in re.findall(r"\w+", text)}
+    recipes = [recipe for name, some in BY_SCHEMA.items() if not name.startswith(OWN_PREFIX) for recipe in some]
+    assert {field for recipe in recipes for field in fields_of(recipe)} - words == set()
+
+
+def test_every_schema_has_a_test_of_its_messages() -> None:
+    """Its name stands in a test of this folder, or of the receivers."""
+    named = texts_of_tests()
     built = {f"septentrio_gnss_driver/msg/{name}" for name in ("PVTGeodetic", "PosCovGeodetic")}
     assert {name for name in BY_SCHEMA if not name.startswith(OWN_PREFIX)} - built - named == set()
 

@@ -14,7 +14,7 @@ from mcap_protobuf.decoder import DecoderFactory
 
 from pipeline.show.export import export_run
 from schemas.errors import UsageError
-from schemas.monitors import MONITORS
+from schemas.monitors import ALL_MONITORS, MONITORS
 from tests.show.export.conftest import Result
 
 
@@ -147,6 +147,9 @@ def test_layout_names_topics_that_exist(exported: Path, content: dict[str, list[
         topic, _, field = value.partition(".")
         assert field in content[topic][0][1].DESCRIPTOR.fields_by_name, value
     assert _leaves(layout["layout"]) == set(layout["configById"])
+    for monitor in ALL_MONITORS:
+        drawn = layout["configById"][f"Plot!{monitor.drawing}"]["paths"]
+        assert f"/primary/monitors.{monitor.name}_ratio" in [path["value"] for path in drawn]
 
 
 def _leaves(node: Any) -> set[str]:

@@ -22,10 +22,12 @@ from pipeline.results.workers import watched
 from pipeline.show.report import page_name, write_page, write_report
 from pipeline.show.report.campaign_page import RUN_COLUMNS
 from pipeline.show.report.route_found import found_route
+from pipeline.show.report.series import SERIES
 from schemas.campaign import STANFORD
 from schemas.errors import UsageError
 from schemas.monitors import MONITORS
 from schemas.run import RunTables, Site
+from schemas.tables import Epochs
 from tests.show.report.conftest import FAILED, REASON, RUNS
 
 
@@ -440,3 +442,12 @@ def test_places_where_the_map_is_in_doubt(replayed: dict[str, RunTables], tmp_pa
         write_run(RunTables(**{**vars(tables), "run_id": run_id, "alarms": first}), tmp_path, {})
     write_report(tmp_path)
     assert rows_of_table(text_of(tmp_path, "index.html"), "table-map")[0][3:6] == ["cross", "2", "2"]
+
+
+def test_every_series_that_the_page_draws_is_a_column_that_it_gets() -> None:
+    """A line of an unknown series is left out without a word."""
+    script = (Path(__file__).parents[3] / "pipeline" / "show" / "report" / "run.js").read_text(encoding="utf-8")
+    drawn = set(re.findall(r'line\(now, "(\w+)"', script))
+    assert len(drawn) > 10
+    assert drawn - {*SERIES, "residual_m"} == set()
+    assert set(SERIES) <= set(Epochs.column_names())
