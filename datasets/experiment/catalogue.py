@@ -21,7 +21,7 @@ from datasets.motion import build_motion
 from datasets.scenario import Scenario
 from datasets.trial import build_run, build_site
 from pipeline.one_run import replay
-from pipeline.results.workers import mapped
+from pipeline.results.workers import map_in_processes
 from schemas.config import Configuration, Vehicle
 from schemas.frozen import frozen
 from schemas.inputs import BaliseReads
@@ -196,7 +196,7 @@ def run_catalogue(
     journeys = dict.fromkeys(one.journey for one in faults)
     tasks = [(journey, number) for journey in journeys for number in range(repetitions)]
     replayed = partial(_replayed, tuple(faults), seed, compared(config or Configuration()))
-    rows = [row for part in mapped(replayed, tasks, jobs) for row in part]
+    rows = [row for part in map_in_processes(replayed, tasks, jobs) for row in part]
     order = {one.name: place for place, one in enumerate(faults)}
     rows.sort(key=lambda row: (order[str(row["fault"])], row["repetition"]))
     return pl.DataFrame(rows, infer_schema_length=None, schema_overrides=_NULLABLE)

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 from pipeline.campaign.plan import Plan, RunJob, find_runs, site_of
 from pipeline.campaign.recorded_log import RecordedLog
 from pipeline.read.site.route import with_route
-from pipeline.results.workers import mapped
+from pipeline.results.workers import map_in_processes
 from schemas.config import Configuration, digest_of
 from schemas.errors import BaliseError, InputError, UsageError
 from schemas.frozen import frozen
@@ -42,7 +42,7 @@ def calibrated(plan: Plan, runs: Sequence[str], jobs: int = 1) -> Plan:
     are of different vehicles.
     """
     automatic = list(runs) == [AUTO]
-    sources = mapped(_source, _jobs_of(plan, runs, automatic), jobs)
+    sources = map_in_processes(_source, _jobs_of(plan, runs, automatic), jobs)
     refused = "; ".join(f"{source.run_id}: {source.reason}" for source in sources if source.reason)
     if refused and not automatic:
         raise UsageError("cannot calibrate", place="--calibrate", found=refused, expected="fault-free runs")

@@ -52,12 +52,12 @@ def compact(out: Address, runs_per_pack: int = RUNS_PER_PACK, jobs: int = 1) -> 
 def undo(out: Address) -> Compaction:
     """Give every run files of its own again, with the bytes that they had."""
     store.complete_runs(out)
-    total = len(packs.find(out))
+    total = len(packs.find_packed(out))
     done = 0
     with locked(out):
         store.sweep(out)
         known = {} if is_url(out) else resume.in_place(str(out))
-        for runs in unpack(out, packs.listed(out)):
+        for runs in unpack(out, packs.read_list(out)):
             done += runs
             tell(done, total)
         return _finished(out, {}, known)
@@ -69,4 +69,4 @@ def _finished(out: Address, left_out: Mapping[str, str], known: Mapping[str, Run
     if known:
         resume.keep_in_place(str(out), known)
     own = len(store.own_runs(out))
-    return Compaction(len(store.run_ids(out)) - own, len(packs.listed(out)), own, left_out)
+    return Compaction(len(store.run_ids(out)) - own, len(packs.read_list(out)), own, left_out)

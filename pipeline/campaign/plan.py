@@ -9,7 +9,7 @@ from dataclasses import field, replace
 from pipeline import storage
 from pipeline.read.site.read import read_site, refuse_unrelated
 from pipeline.results import store
-from pipeline.results.manifest import SettingsFiles, listing, settings_files, unaltered
+from pipeline.results.manifest import SettingsFiles, file_list_text, settings_files, unaltered_metadata
 from pipeline.results.software import software_digest
 from pipeline.storage import files
 from pipeline.storage.address import Address, join, name_of, redacted, stem_of
@@ -135,7 +135,7 @@ def make_plan(
         address="",
         site=storage.absolute(site),
         site_digest=ground.digest,
-        site_files=listing(ground.files),
+        site_files=file_list_text(ground.files),
         config=config,
         vehicle=vehicle,
         out=storage.absolute(out),
@@ -171,7 +171,7 @@ def with_previous(plan: Plan, known: Collection[str] = ()) -> Plan:
     A run whose marker is not the one that its campaign wrote is not complete.
     """
     left = [job for job in plan.jobs if job.run_id not in known]
-    complete = unaltered(plan.out, [job.run_id for job in left])
+    complete = unaltered_metadata(plan.out, [job.run_id for job in left])
     return replace(plan, jobs=tuple(replace(job, previous=complete.get(job.run_id)) for job in left))
 
 

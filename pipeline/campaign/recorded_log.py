@@ -41,7 +41,7 @@ class RecordedLog:
         self._version = self._stored_version()
         if self._version is None or self._job.previous is None:
             return ""
-        return (catalogue.kept(self._job.out, self._note(), self._key()) or b"").decode()
+        return (catalogue.kept_content(self._job.out, self._note(), self._key()) or b"").decode()
 
     def _note(self) -> str:
         """Name of the file that keeps what is known of a log from campaign to campaign."""
@@ -77,7 +77,7 @@ class RecordedLog:
             self.digest_at(path)
             raise
         self.digest_at(path, run.input_digest)
-        self.raw_files = manifest.listing(run.notes.raw_logs) if run.notes.raw_logs else ""
+        self.raw_files = manifest.file_list_text(run.notes.raw_logs) if run.notes.raw_logs else ""
         return run
 
     def digest_at(self, path: Path, known: str = "") -> str:
@@ -86,7 +86,7 @@ class RecordedLog:
             with _as_input_error(path):
                 listed = storage.file_digests(path, known)
             self.digest = storage.digest_of_files(listed)
-            self.files = manifest.listing(listed)
+            self.files = manifest.file_list_text(listed)
             if self._version is not None:
                 catalogue.keep(self._job.out, self._note(), self._key(), self.digest.encode())
         return self.digest

@@ -79,7 +79,7 @@ def _keep(out: str, outcomes: list[RunOutcome]) -> None:
 
 def kept(out: str) -> dict[str, RunOutcome]:
     """The outcomes that this build of the program kept, by run id."""
-    content = None if is_url(out) else catalogue.kept(out, _NAME, software_digest())
+    content = None if is_url(out) else catalogue.kept_content(out, _NAME, software_digest())
     try:
         outcomes = _OUTCOMES.validate_json(content or b"[]")
     except ValueError:
@@ -104,7 +104,7 @@ def _made_of(job: RunJob, log: tuple[storage.FileState, ...]) -> str:
 
 def _places(out: str, runs: Sequence[str]) -> dict[str, str]:
     """What changes with the marker of each of these runs that is there: with its `runs` file, or its pack's index."""
-    packed = store.packed(out, runs)
+    packed = store.packed_runs_among(out, runs)
     files = {run: store.table_address(out, "runs", run) for run in runs}
     files |= {run: join(out, packs.file_name(packs.INDEX, place.pack.name)) for run, place in packed.items()}
     states = {file: storage.version(file) for file in set(files.values())}

@@ -336,7 +336,7 @@ def _is_current(out: Address, key: str) -> bool:
     """Whether all of these tables are there, made from these runs, and as the manifest has them."""
     names = [f"campaign/{name.removeprefix('campaign_')}.parquet" for name in CAMPAIGN_TABLES]
     contents = {name: storage.content_of(join(out, name)) for name in names}
-    expected = manifest.earlier(out)["files"]
+    expected = manifest.earlier_manifest(out)["files"]
     return all(
         content is not None
         and metadata_of(content).get(_MADE_FROM) == key

@@ -19,7 +19,7 @@ from pipeline.campaign.plan import RunJob, make_plan
 from pipeline.campaign.run import campaign_files, campaign_key, run_campaign
 from pipeline.campaign.watch import Follower
 from pipeline.results import catalogue, packs, store
-from pipeline.results.manifest import NAME, Manifest, anchor, earlier, gathered, read_manifest
+from pipeline.results.manifest import NAME, Manifest, anchor, earlier_manifest, gather_manifest, read_manifest
 from pipeline.results.marker import sha256
 from pipeline.results.outcome import RunOutcome
 from pipeline.results.packing import not_as_marked
@@ -86,7 +86,7 @@ def verify(out: Address) -> Verification:
     runs' tables. Files that the manifest does not name are listed. Raises `UsageError` where there is no manifest.
     """
     manifest = _manifest(out)
-    again = gathered(out, manifest)
+    again = gather_manifest(out, manifest)
     there = again["runs"]
     named = manifest["runs"]
     problems = [_only_in_one(run, run in there) for run in sorted(there.keys() ^ named.keys())]
@@ -100,7 +100,7 @@ def verify(out: Address) -> Verification:
         tell(min(first + _RUNS_AT_ONCE, len(runs)), len(runs))
     known = {*manifest["files"], *again["files"], *_OWN_FILES}
     problems += [(name, "there", "not in the manifest") for name in _other_files(out, {*there, *named}, known)]
-    not_compared = _DERIVED + ((NotCompared.PACKS,) if packs.listed(out) else ())
+    not_compared = _DERIVED + ((NotCompared.PACKS,) if packs.read_list(out) else ())
     if not problems:
         problems, not_compared = _made_again(out, {run["software_digest"] for run in there.values()})
         of_packs, unlike = _unpacked(out, there)
@@ -113,7 +113,7 @@ def verify(out: Address) -> Verification:
 def _of_runs(out: Address, runs: Sequence[str], there: dict[str, Any], named: dict[str, Any]) -> Iterator[Problem]:
     """Provenance and tables of some runs; and of tables that agree with the manifest, what the marker says of them."""
     of_run = {run: metadata.get("run_id", "") for run, metadata in store.completed_runs(out, runs).items()}
-    packed = store.packed(out, runs)
+    packed = store.packed_runs_among(out, runs)
     contents = _tables(out, [run for run in runs if run not in packed])
     for run in runs:
         # What stands in its pack was found the same as its files, and the files of the pack are compared.
@@ -150,7 +150,7 @@ def recompute(
         ready = tuple(job for job in known if job.config_digest == named[job.run_id]["config_digest"])
         if ready:
             run_campaign(replace(plan, jobs=ready), jobs=jobs, watches=watches)
-        again = gathered(folder, earlier(folder))["runs"]
+        again = gather_manifest(folder, earlier_manifest(folder))["runs"]
     others = [named[job.run_id]["config_digest"] for job in known if job not in ready]
     problems = [
         (f"settings of {_runs(others.count(digest))}", "others", _settings(digest, _manifest(out)))
@@ -208,7 +208,7 @@ def _manifest(out: Address) -> Manifest:
 
 def _packs(out: Address) -> Iterator[Problem]:
     """Files of packs against the list of packs, which the manifest names."""
-    for pack in packs.listed(out):
+    for pack in packs.read_list(out):
         expected = packs.file_digests(pack)
         yield from _differences("", {name: sha256(storage.content_of(join(out, name))) for name in expected}, expected)
 
@@ -220,7 +220,7 @@ def _unpacked(out: Address, there: Mapping[str, Any]) -> tuple[list[Problem], tu
     """
     problems: list[Problem] = []
     unlike: tuple[NotCompared, ...] = ()
-    for pack in with_progress(packs.listed(out)):
+    for pack in with_progress(packs.read_list(out)):
         for run, table in not_as_marked(out, pack):
             if there[run]["software_digest"] == software_digest():
                 problems.append((f"run {run}, {table} in its pack", "other rows", "those of its marker"))
@@ -252,9 +252,9 @@ def _pages(out: Address) -> dict[str, str]:
 def _other_files(out: Address, runs: set[str], known: set[str]) -> Iterator[str]:
     """Files that are neither known, nor of a run, nor of `balise line`; pages and catalogue are looked at elsewhere."""
     # Beside the rows of a packed run its own files are read by nobody but those who read all files.
-    own = runs - store.packed(out, runs).keys()
+    own = runs - store.packed_runs_among(out, runs).keys()
     of_runs = {f"{table}/{store.folder_name(run)}/{table}.parquet" for table in TABLES for run in own}
-    expected = of_runs | known | {name for pack in packs.listed(out) for name in packs.file_digests(pack)}
+    expected = of_runs | known | {name for pack in packs.read_list(out) for name in packs.file_digests(pack)}
     for name in storage.files_below(out):
         if name not in expected and not name.startswith((f"{catalogue.FOLDER}/", "report/", "line/")):
             yield name

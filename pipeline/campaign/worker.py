@@ -23,7 +23,7 @@ from pipeline.campaign.recorded_log import RecordedLog
 from pipeline.campaign.resume import proof_of
 from pipeline.read.site.route import with_route
 from pipeline.results import store
-from pipeline.results.manifest import tables_noted
+from pipeline.results.manifest import digests_in_marker
 from pipeline.results.marker import sha256
 from pipeline.results.outcome import RunOutcome
 from pipeline.results.software import software_digest
@@ -126,7 +126,7 @@ def _is_done(job: RunJob, files_digest: str) -> bool:
 
 def _is_whole(job: RunJob, marker: Mapping[str, str]) -> bool:
     """The tables that the outcome is read from are those that the marker was written with."""
-    expected = tables_noted(marker)
+    expected = digests_in_marker(marker)
     return all(sha256(store.content_of(job.out, name, job.run_id)) == expected.get(name) for name in _OUTCOME)
 
 

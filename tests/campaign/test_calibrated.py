@@ -16,7 +16,7 @@ from pipeline.campaign import Plan, make_plan, run_campaign
 from pipeline.campaign import calibrated as calibrated_module
 from pipeline.campaign.calibrated import calibrated
 from pipeline.campaign.plan import RunJob
-from pipeline.results.workers import mapped
+from pipeline.results.workers import map_in_processes
 from schemas.config import Vehicle
 from schemas.errors import UsageError
 from tests.campaign.compare import campaign_bytes, result_bytes
@@ -59,7 +59,7 @@ def remembered(monkeypatch: pytest.MonkeyPatch) -> None:
     def each_once(function: Callable[[RunJob], Any], tasks: Sequence[RunJob], jobs: int) -> list[Any]:
         return [_SEEN.setdefault(task.address, _SEEN.get(task.address) or function(task)) for task in tasks]
 
-    monkeypatch.setattr(calibrated_module, "mapped", each_once)
+    monkeypatch.setattr(calibrated_module, "map_in_processes", each_once)
 
 
 @pytest.mark.usefixtures("in_process", "remembered")
@@ -92,7 +92,7 @@ class TestAuto:
     ) -> None:
         run_campaign(auto(plan_of(trial, tmp_path / "one", "runs")))
         with monkeypatch.context() as measured_again:
-            measured_again.setattr(calibrated_module, "mapped", mapped)
+            measured_again.setattr(calibrated_module, "map_in_processes", map_in_processes)
             run_campaign(auto(plan_of(trial, tmp_path / "other", names=NOISY[::-1])))
         assert result_bytes(tmp_path / "one") == result_bytes(tmp_path / "other")
         assert campaign_bytes(tmp_path / "one") == campaign_bytes(tmp_path / "other")

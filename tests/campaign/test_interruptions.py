@@ -62,7 +62,7 @@ def test_stop_on_request(small_trial: SmallTrial, undisturbed: Path, tmp_path: P
     assert 2 <= len(done) <= 4
     whole = result_bytes(undisturbed)
     assert all(whole[name] == data for name, data in result_bytes(out).items())
-    assert run_campaign(plan_of(small_trial, out)).skipped == len(done)
+    assert run_campaign(plan_of(small_trial, out)).count_skipped == len(done)
     assert result_bytes(out) == whole
     assert campaign_bytes(out) == campaign_bytes(undisturbed)
 
@@ -114,7 +114,7 @@ def test_stop_on_request_at_the_very_end(
     assert caught.value.summary is not None
     assert caught.value.summary.count(RunStatus.OK) == 1
     assert not (tmp_path / "campaign").exists()
-    assert run_campaign(plan).skipped == 1
+    assert run_campaign(plan).count_skipped == 1
     assert (tmp_path / "campaign/runs.parquet").exists()
 
 
@@ -219,7 +219,7 @@ def test_full_disk(
         whole = result_bytes(undisturbed)
         assert all(whole[name] == data for name, data in result_bytes(out).items() if ".tmp" not in name)
         subprocess.run(["mount", "-o", "remount,size=64m", str(disk)], check=True)
-        assert run_campaign(plan_of(small_trial, out)).skipped == len(complete)
+        assert run_campaign(plan_of(small_trial, out)).count_skipped == len(complete)
         assert result_bytes(out) == whole
 
 

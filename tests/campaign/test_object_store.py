@@ -119,7 +119,7 @@ def test_same_bytes_as_on_disk(bucket: str, undisturbed: Path, tmp_path: Path, r
     assert run_campaign(plan, jobs=1).count(RunStatus.OK) == 2
     assert remote_bytes(f"{bucket}/out") == of_two(result_bytes(undisturbed))
     again = run_campaign(plan, jobs=1)
-    assert (again.skipped, again.count(RunStatus.OK)) == (2, 2)
+    assert (again.count_skipped, again.count(RunStatus.OK)) == (2, 2)
     request.getfixturevalue("in_process")
     local = run_campaign(make_plan([f"{bucket}/runs/run0", f"{bucket}/runs/run1"], f"{bucket}/site", tmp_path))
     assert local.count(RunStatus.OK) == 2
@@ -195,7 +195,7 @@ def test_log_that_cannot_be_had_now_is_tried_again(
     assert (first.count(RunStatus.OK), first.count(RunStatus.FAILED)) == (1, 1)
     assert "the store refused" in (by_run(first)["run2"].error or "")
     again = run_campaign(plan)
-    assert (again.count(RunStatus.OK), again.skipped) == (2, 1)
+    assert (again.count(RunStatus.OK), again.count_skipped) == (2, 1)
 
 
 @pytest.mark.usefixtures("in_process")
@@ -204,10 +204,10 @@ def test_logs_are_not_fetched_again(s3: Moody, bucket: str, tmp_path: Path) -> N
     run_campaign(plan)
     assert any("/runs/run1/" in place for place in s3.fetched)
     s3.fetched.clear()
-    assert run_campaign(plan).skipped == 2
+    assert run_campaign(plan).count_skipped == 2
     assert [place for place in s3.fetched if "/runs/" in place] == []
     shutil.rmtree(tmp_path / ".catalogue")
-    assert run_campaign(plan).skipped == 2
+    assert run_campaign(plan).count_skipped == 2
     assert any("/runs/run1/" in place for place in s3.fetched)
 
 
@@ -218,12 +218,12 @@ def test_changed_log_in_a_store_is_replayed_again(bucket: str, small_trial: Smal
     remote = s3fs.S3FileSystem(use_listings_cache=False)
     remote.put(f"{small_trial.paths[0]}/", "trials/changing/run0/", recursive=True)
     plan = make_plan([f"{bucket}/changing/run0"], small_trial.site, tmp_path)
-    assert [run_campaign(plan).skipped for _ in range(2)] == [0, 1]
+    assert [run_campaign(plan).count_skipped for _ in range(2)] == [0, 1]
     place = "trials/changing/run0/odometer.parquet"
     content = bytearray(remote.cat(place))
     content[content.index(b"ARROW:schema")] ^= 1
     remote.pipe(place, bytes(content))
-    assert [run_campaign(plan).skipped for _ in range(2)] == [0, 1]
+    assert [run_campaign(plan).count_skipped for _ in range(2)] == [0, 1]
 
 
 def test_log_that_changes_while_it_is_fetched(
