@@ -230,10 +230,10 @@ def _status_of(summary: CampaignSummary, fail_on: str | None) -> int:
 
 
 def _calibrated(plan: Plan, runs: list[str], jobs: int, quiet: bool) -> Plan:
-    from pipeline.campaign.calibrated import calibrated
+    from pipeline.campaign.calibrated import calibrate_plan
 
     with _telling("runs looked at to calibrate", quiet):
-        return calibrated(plan, runs, jobs)
+        return calibrate_plan(plan, runs, jobs)
 
 
 @_command(
@@ -475,21 +475,20 @@ def claim(
 ) -> None:
     """Compare a result with published requirements for train localisation: met, not met or not shown."""
     from pipeline.results.answer_files import write_csv
-    from pipeline.studies.claim import claim as hold
-    from pipeline.studies.claim import for_reading, load_profile, read_areas
+    from pipeline.studies.claim import assess_claim, load_profile, read_areas, rows_for_reading
 
     wanted = load_profile(profile)
     ground = _ground(site, _used(out)) if site else None
     areas = read_areas(site, ground) if site and ground else None
     with _telling("runs"):
-        found = hold(out, wanted, ground, areas, front_ahead)
+        found = assess_claim(out, wanted, ground, areas, front_ahead)
     if csv is not None:
         write_csv(found.table, csv)
     if as_json or str(csv) != "-":
         head = {"profile": wanted.name, "version": wanted.version, "sources": list(wanted.sources)}
         title = f"{wanted.name}, version {wanted.version}: {'; '.join(wanted.sources)}"
         answer = {**head, "notes": found.notes, "requirements": found.table}
-        _tell(as_json, answer, {title: for_reading(found)}, "", *found.notes)
+        _tell(as_json, answer, {title: rows_for_reading(found)}, "", *found.notes)
 
 
 @_command(
@@ -893,19 +892,19 @@ def verify(
     project: OfProject = None,
 ) -> None:
     """Check a result against its manifest; with --logs, replay the logs again and compare every table."""
-    from pipeline.campaign.verify import as_kept, recompute
     from pipeline.campaign.verify import verify as compare
+    from pipeline.campaign.verify import verify_by_replay, verify_manifest
     from pipeline.results.manifest import anchor, anchor_words
     from pipeline.show.progress import progress_watch
 
-    found = [as_kept(out, expect)] if expect else []
+    found = [verify_manifest(out, expect)] if expect else []
     with _telling("runs", quiet):
         found.append(compare(out))
     if logs:
         settings = _configuration(config) if config else None
         shown = [] if quiet else [progress_watch()]
         found += _from_raw_logs(logs, project)
-        found.append(recompute(out, logs, site, settings, _vehicle(vehicle), route, jobs, shown))
+        found.append(verify_by_replay(out, logs, site, settings, _vehicle(vehicle), route, jobs, shown))
     if as_json:
         compared = [{"compared": v.compared, "not_compared": v.not_compared, "problems": v.table} for v in found]
         digest, runs = anchor(out)

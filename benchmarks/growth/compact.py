@@ -108,7 +108,7 @@ def _many(folder: Path, log: Path, count: int) -> Plan:
     # Files that were linked just now count as written just now.
     WAITS.settled_s = 0.0
     proofs = {job.run_id: resume.proof_of(job, storage.signature(Path(job.address))) for job in plan.jobs}
-    resume.keep(plan, [replace(outcome, run_id=name, proof=proof) for name, proof in proofs.items()])
+    resume.keep_outcomes(plan, [replace(outcome, run_id=name, proof=proof) for name, proof in proofs.items()])
     return plan
 
 

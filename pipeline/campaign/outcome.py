@@ -41,17 +41,17 @@ class ChangedError(InputError):
     """The log was written to while it was read: trying again may succeed."""
 
 
-def changed(address: Address) -> ChangedError:
+def changed_error(address: Address) -> ChangedError:
     """The error for a log that changed while it was read."""
     return ChangedError("changed while it was read", place=str(address), remedy="Replay it again when it is complete.")
 
 
-def overdue(limit_s: float) -> str:
+def overdue_text(limit_s: float) -> str:
     """The error text of a run that took too long."""
     return f"took longer than the time limit of {limit_s:g} s"
 
 
-def lost(attempts: int) -> str:
+def lost_text(attempts: int) -> str:
     """The error text of a run whose workers died."""
     return (
         f"its worker died {attempts} times (killed, or out of memory). "
@@ -59,7 +59,7 @@ def lost(attempts: int) -> str:
     )
 
 
-def never_begun(workers: int) -> str:
+def never_begun_text(workers: int) -> str:
     """The error text of a run for which no worker came up."""
     return f"{workers} workers died before they started this run. See the logs of the workers."
 
@@ -67,7 +67,7 @@ def never_begun(workers: int) -> str:
 def failure_of(error: BaseException, lasting: bool) -> RunFailure:
     """A failure in words, and whether the same input would fail again."""
     if isinstance(error, BaliseError):
-        again = isinstance(error, InputError) and not isinstance(error, ChangedError) and not _is_of_the_machine(error)
+        again = isinstance(error, InputError) and not isinstance(error, ChangedError) and not _may_pass(error)
         return RunFailure(redacted(str(error)), lasting and again)
     if _lacks_memory(error):
         return RunFailure(NO_MEMORY, lasting=False)
@@ -87,7 +87,7 @@ def _lacks_memory(error: BaseException | None) -> bool:
     return False
 
 
-def _is_of_the_machine(error: BaseException | None) -> bool:
+def _may_pass(error: BaseException | None) -> bool:
     """A disk or a share that did not give the log may give it the next time; a file that is not there is the log's."""
     while error is not None:
         if isinstance(error, OSError) and error.errno is not None and not isinstance(error, FileNotFoundError):
@@ -96,7 +96,7 @@ def _is_of_the_machine(error: BaseException | None) -> bool:
     return False
 
 
-def worst(runs: pl.DataFrame) -> RunStatus:
+def worst_status(runs: pl.DataFrame) -> RunStatus:
     """The status of a run with several solutions: the worst of theirs."""
     statuses = set(runs["status"].cast(pl.String).to_list())
     return next((s for s in (RunStatus.FAILED, RunStatus.PARTIAL) if s.value in statuses), RunStatus.OK)
@@ -113,19 +113,19 @@ def outcome_of(
     verdict = worst_verdict(runs["verdict"].to_list())
     return RunOutcome(
         run_id=run_id,
-        status=worst(runs),
+        status=worst_status(runs),
         error=errors[0] if errors else None,
         verdict=verdict,
         hazards=sum(counts) if judged.height else None,
         missed_detections=missed if judged.height else None,
-        why=_why(runs, verdict),
+        why=_verdict_reasons(runs, verdict),
         faults=tuple(hazard_words(hazards, passages)),
         log=redacted(log),
-        **_figures_of_verdict(runs, verdict, low),
+        **_verdict_figures(runs, verdict, low),
     )
 
 
-def _figures_of_verdict(runs: pl.DataFrame, verdict: RunVerdict | None, low: float) -> dict[str, Any]:
+def _verdict_figures(runs: pl.DataFrame, verdict: RunVerdict | None, low: float) -> dict[str, Any]:
     """Figures next to the verdict, of the solution that heads the run; nothing where all failed."""
     if verdict is None:
         return {}
@@ -138,7 +138,7 @@ def _figures_of_verdict(runs: pl.DataFrame, verdict: RunVerdict | None, low: flo
     return figures | {"lost": lost_words(row["lost_to"], row["lost_to_share"], row["lost_to_monitor"], 1.0 - available)}
 
 
-def _why(runs: pl.DataFrame, verdict: RunVerdict | None) -> str:
+def _verdict_reasons(runs: pl.DataFrame, verdict: RunVerdict | None) -> str:
     """What decides the verdict, of each solution that has it."""
     if verdict is None:
         return ""

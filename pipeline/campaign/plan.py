@@ -23,13 +23,13 @@ from schemas.version import SOFTWARE
 _held: dict[tuple[str, SiteConfig], Site] = {}
 
 
-def hold(site: Site, config: SiteConfig) -> None:
+def hold_site(site: Site, config: SiteConfig) -> None:
     """Keep the site of this process, so that no run reads it again."""
     _held.clear()
     _held[site.digest, config] = site
 
 
-def held() -> list[tuple[Site, SiteConfig]]:
+def held_sites() -> list[tuple[Site, SiteConfig]]:
     """What a new worker is to hold."""
     return [(site, config) for (_, config), site in _held.items()]
 
@@ -42,7 +42,7 @@ def site_of(address: str, digest: str, config: SiteConfig) -> Site:
         if site.digest != digest:
             remedy = "Start the campaign again."
             raise SiteError("has changed since the campaign began", place=redacted(address), remedy=remedy)
-        hold(site, config)
+        hold_site(site, config)
     return _held[digest, config]
 
 
@@ -129,7 +129,7 @@ def make_plan(
         raise UsageError(error.message, place=error.place, expected=error.expected, remedy=error.remedy) from None
     ground = read_site(site, config.site)
     refuse_unrelated(ground, site)
-    hold(ground, config.site)
+    hold_site(ground, config.site)
     base = RunJob(
         run_id="",
         address="",
@@ -175,7 +175,7 @@ def with_previous(plan: Plan, known: Collection[str] = ()) -> Plan:
     return replace(plan, jobs=tuple(replace(job, previous=complete.get(job.run_id)) for job in left))
 
 
-def digests(job: RunJob, files_digest: str) -> dict[str, str]:
+def run_digests(job: RunJob, files_digest: str) -> dict[str, str]:
     """What decides a run's tables; equal digests mean equal tables, so that the run is skipped."""
     return {
         "config_digest": job.config_digest,
@@ -200,7 +200,7 @@ def find_runs(named: Iterable[str]) -> dict[str, str]:
     """
     addresses: dict[str, str] = {}
     for name in named:
-        for address in _expand(name):
+        for address in _logs_at(name):
             run_id = stem_of(address)
             _check_name(run_id, address)
             first = addresses.setdefault(run_id, storage.absolute(address))
@@ -227,7 +227,7 @@ def _check_name(run_id: str, address: Address) -> None:
         raise UsageError(reason, place=redacted(str(address)), remedy="Rename it: results are stored by run id.")
 
 
-def _expand(name: str) -> list[Address]:
+def _logs_at(name: str) -> list[Address]:
     """Logs at a place; what its name does not show to be no run is taken for one until it is read."""
     matches = storage.require_match(name)
     return [

@@ -12,7 +12,7 @@ from pipeline.results.manifest import NAME
 from pipeline.show.terminal import show_tables, to_json, turn_table
 from pipeline.stages.run_row.bounds import bound_columns
 from pipeline.studies.safety.assessment import SOURCES, Assessment
-from pipeline.studies.safety.budget import published
+from pipeline.studies.safety.budget import published_table
 from schemas.campaign import CampaignFigures
 from schemas.errors import visible
 
@@ -86,7 +86,7 @@ def _unit_and_source(name: str) -> tuple[str, str]:
     column = CampaignFigures.columns()[name]
     unit = str((column.metadata or {}).get("unit", "")) or "1"
     # By the beginning of the figure's name, the first that fits; docs/domain.md is DOMAIN.
-    sources = published("figure_sources").iter_rows()
+    sources = published_table("figure_sources").iter_rows()
     return unit, next((source for start, source in sources if name.startswith(start)), "")
 
 

@@ -57,7 +57,7 @@ def _piece_features(result: LineResult) -> list[dict[str, object]]:
     pieces = result.line.pieces
     shares = np.linspace(0.0, 1.0, 6)
     measures = pieces.from_m[:, None] + (pieces.to_m - pieces.from_m)[:, None] * shares
-    elements = pl.Series(np.repeat(pieces.names, shares.size), dtype=pl.String)
+    elements = pl.Series(np.repeat(pieces.element_names, shares.size), dtype=pl.String)
     lines = _coordinates(result, elements, measures.ravel()).reshape(-1, shares.size, 2).tolist()
     rows = result.pieces.iter_rows(named=True)
     return [_feature("LineString", lines[row["piece"]], {"kind": "piece", **row}) for row in rows]

@@ -157,7 +157,7 @@ class JsonWatch(LineWatch):
         """Say where the campaign stands now."""
         self._print_event("progress", **self.figures(under_way))
 
-    def counted(self, outcome: RunOutcome) -> None:
+    def show_outcome(self, outcome: RunOutcome) -> None:
         """Say what became of a run."""
         names = (
             *("run_id", "status", "error", "skipped", "attempts", "hazards", "missed_detections"),
@@ -230,7 +230,7 @@ class LogWatch(CampaignWatch):
         self._lines = list[str]()
         self.noted(f"{SOFTWARE}: {runs} runs")
 
-    def counted(self, outcome: RunOutcome) -> None:
+    def show_outcome(self, outcome: RunOutcome) -> None:
         """Write what became of a run, with the trace of a defect."""
         self.noted(outcome_line(outcome))
         if outcome.trace:

@@ -19,7 +19,7 @@ from benchmarks.growth import interruptions
 from benchmarks.growth.interruptions import Job, Victim, disturb
 from pipeline import storage
 from pipeline.campaign import Interrupted, make_plan, run_campaign
-from pipeline.campaign.lock import locked
+from pipeline.campaign.lock import hold_output
 from pipeline.campaign.worker import replay_one
 from pipeline.results import store
 from pipeline.storage.address import Address
@@ -146,7 +146,7 @@ def test_a_campaign_that_has_ended_writes_no_more(small_trial: SmallTrial, tmp_p
     orphan = replace(plan.jobs[0], campaign="lost")
     with pytest.raises(OutputError, match="no longer held by this campaign"):
         replay_one(orphan)
-    with locked(tmp_path), pytest.raises(OutputError, match="no longer held by this campaign"):
+    with hold_output(tmp_path), pytest.raises(OutputError, match="no longer held by this campaign"):
         replay_one(orphan)
     assert result_bytes(tmp_path) == before
 

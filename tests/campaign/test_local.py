@@ -18,7 +18,7 @@ import pytest
 from datasets.mcap_log import write_mcap
 from pipeline import storage
 from pipeline.campaign import CampaignSummary, RunOutcome, ground, make_plan, recorded_log, run_campaign
-from pipeline.campaign.outcome import lost, never_begun
+from pipeline.campaign.outcome import lost_text, never_begun_text
 from pipeline.campaign.waits import WAITS
 from pipeline.read.ingest import read_run
 from pipeline.results import store
@@ -288,7 +288,7 @@ def test_workers_that_never_start_fail_their_runs(
     plan = plan_of(small_trial, tmp_path, small_trial.paths[:2])
     monkeypatch.setattr(SpawnProcess, "start", start)
     summary = run_campaign(plan, jobs=2)
-    assert [outcome.error for outcome in summary.outcomes] == [never_begun(WAITS.starts)] * 2
+    assert [outcome.error for outcome in summary.outcomes] == [never_begun_text(WAITS.starts)] * 2
     assert run_campaign(plan).count(RunStatus.FAILED) == 2
 
 
@@ -306,7 +306,7 @@ def test_run_whose_worker_always_dies_is_reported(small_trial: SmallTrial, tmp_p
     plan = plan_of(small_trial, tmp_path / "out", [tmp_path / "deadly.mcap", *small_trial.paths[:1]])
     summary = by_run(run_campaign(plan, jobs=1, watches=[Spy(kill_it)]))
     assert summary["deadly"].status is RunStatus.FAILED
-    assert summary["deadly"].error == lost(2)
+    assert summary["deadly"].error == lost_text(2)
     assert summary["run0"].status is RunStatus.OK
     assert len(deaths) >= 2
     assert store.completed_runs(tmp_path / "out")["deadly"]["redo"] == "yes"
@@ -338,10 +338,10 @@ def test_single_run_is_given_up_too(tmp_path: Path, small_trial: SmallTrial) -> 
 
 
 def test_output_held_by_another_campaign(small_trial: SmallTrial, tmp_path: Path) -> None:
-    from pipeline.campaign.lock import locked
+    from pipeline.campaign.lock import hold_output
 
     plan = plan_of(small_trial, tmp_path, small_trial.paths[:1])
-    with locked(tmp_path), pytest.raises(OutputError, match="another campaign is writing here"):
+    with hold_output(tmp_path), pytest.raises(OutputError, match="another campaign is writing here"):
         run_campaign(plan)
     assert run_campaign(plan).count(RunStatus.OK) == 1
 

@@ -14,7 +14,7 @@ from werkzeug.serving import BaseWSGIServer, make_server
 
 from pipeline import storage
 from pipeline.campaign import lock, make_plan, run_campaign
-from pipeline.campaign.lock import locked
+from pipeline.campaign.lock import hold_output
 from pipeline.campaign.verify import verify
 from pipeline.campaign.waits import WAITS
 from pipeline.results import store
@@ -256,21 +256,21 @@ def _quick_beat(monkeypatch: pytest.MonkeyPatch) -> None:
 @pytest.mark.usefixtures("_quick_beat")
 def test_one_campaign_at_a_time(bucket: str) -> None:
     out = f"{bucket}/held"
-    with locked(out), pytest.raises(OutputError, match="another campaign is writing here"), locked(out):
+    with hold_output(out), pytest.raises(OutputError, match="another campaign is writing here"), hold_output(out):
         pass
-    with locked(out):
+    with hold_output(out):
         pass
 
 
 @pytest.mark.usefixtures("_quick_beat")
 def test_lock_that_was_taken_over_is_left_alone(bucket: str) -> None:
     place = f"{bucket}/taken/.lock"
-    with locked(f"{bucket}/taken") as own:
+    with hold_output(f"{bucket}/taken") as own:
         lock.check_held(f"{bucket}/taken", own)
         storage.write_bytes(place, b"another 0")
         with pytest.raises(OutputError, match="no longer held"):
             lock.check_held(f"{bucket}/taken", own)
-        wait_for(lambda: not any(getattr(one, "_target", None) is lock._beat for one in threading.enumerate()))
+        wait_for(lambda: not any(getattr(one, "_target", None) is lock._renew_lock for one in threading.enumerate()))
     assert storage.read_many([place]) == {place: b"another 0"}
 
 
@@ -278,6 +278,6 @@ def test_lock_that_was_taken_over_is_left_alone(bucket: str) -> None:
 def test_lock_of_a_dead_campaign_is_taken_over(bucket: str, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(WAITS, "lock_silence_s", 1.0)
     storage.write_bytes(f"{bucket}/dead/.lock", b"somebody 7")
-    with locked(f"{bucket}/dead"):
+    with hold_output(f"{bucket}/dead"):
         assert b"somebody" not in storage.read_many([f"{bucket}/dead/.lock"])[f"{bucket}/dead/.lock"]
     assert storage.read_many([f"{bucket}/dead/.lock"]) == {}

@@ -74,9 +74,9 @@ def test_whatever_changed_is_looked_into(settled: tuple[SmallTrial, Path], chang
         case "damaged":
             (out / ".catalogue/complete").write_text("[{}")
     plan = make_plan([str(trial.runs)], trial.site, out, config)
-    assert resume.unchanged(plan) == []
+    assert resume.unchanged_outcomes(plan) == []
     assert run_campaign(plan).count_skipped == (change in ("catalogue", "damaged"))
-    assert len(resume.unchanged(plan)) == 1
+    assert len(resume.unchanged_outcomes(plan)) == 1
 
 
 def test_a_log_that_was_just_written_is_read_again(
@@ -86,7 +86,7 @@ def test_a_log_that_was_just_written_is_read_again(
     trial, out = settled
     monkeypatch.setattr(WAITS, "settled_s", 3600.0)
     run_campaign(plan_of(trial, out), force=True)
-    assert resume.unchanged(plan_of(trial, out)) == []
+    assert resume.unchanged_outcomes(plan_of(trial, out)) == []
 
 
 def test_what_the_disk_did_not_give_is_no_failure_of_the_log() -> None:

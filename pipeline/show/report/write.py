@@ -36,7 +36,7 @@ from pipeline.storage.address import Address
 from pipeline.storage.parquet import parquet_bytes, read_parquet
 from pipeline.studies.safety.assessment import compare_architectures
 from pipeline.studies.safety.side_by_side import side_by_side
-from pipeline.studies.safety.tally import COUNTS, added
+from pipeline.studies.safety.tally import COUNTS, add_counts
 from schemas.config import Configuration, to_toml
 from schemas.errors import UsageError
 from schemas.frozen import frozen
@@ -242,7 +242,9 @@ def _concat_column(rows: pl.DataFrame, name: str) -> pl.DataFrame:
 def _parts_of_pages(rows: Sequence[pl.DataFrame]) -> tuple[pl.DataFrame, pl.DataFrame]:
     """Pieces and architectures of all runs, where all of them have a page."""
     together_rows = pl.concat(rows)
-    return combine_pieces(_concat_column(together_rows, "pieces")), added([_concat_column(together_rows, "tallies")])
+    return combine_pieces(_concat_column(together_rows, "pieces")), add_counts(
+        [_concat_column(together_rows, "tallies")]
+    )
 
 
 def _parts_of_tables(out: Path, made: Made) -> tuple[pl.DataFrame, pl.DataFrame]:
@@ -255,7 +257,7 @@ def _parts_of_tables(out: Path, made: Made) -> tuple[pl.DataFrame, pl.DataFrame]
         availability_pieces(tables_of(out, "epochs", some, PIECE_COLUMNS).lazy()) for some in with_progress(portions)
     ]
     runs, hazards, alarms = (store.read_table(out, table).collect() for table in ("runs", "hazards", "alarms"))
-    return combine_pieces(pl.concat(pieces)), added(
+    return combine_pieces(pl.concat(pieces)), add_counts(
         compare_architectures(out, runs, hazards, alarms, made.config).values()
     )
 
