@@ -226,14 +226,14 @@ def _stopped(interrupted: Interrupted, out: str, quiet: bool, as_json: bool, pla
 def _status_of(summary: CampaignSummary, fail_on: str | None) -> int:
     refused = {"unsafe": ["unsafe"], "unproven": ["unsafe", "unproven"]}.get(fail_on or "", [])
     acceptable = summary.all_ok and not any(summary.head.counts()[verdict] for verdict in refused)
-    return DEFECT if summary.defects else OK if acceptable else RUNS_NOT_OK
+    return DEFECT if summary.count_defects else OK if acceptable else RUNS_NOT_OK
 
 
 def _calibrated(plan: Plan, runs: list[str], jobs: int, quiet: bool) -> Plan:
-    from pipeline.campaign.calibrated import calibrated
+    from pipeline.campaign.calibrated import calibrate_plan
 
     with _telling("runs looked at to calibrate", quiet):
-        return calibrated(plan, runs, jobs)
+        return calibrate_plan(plan, runs, jobs)
 
 
 @_command(
@@ -323,14 +323,14 @@ def run(
     from pipeline.project.run import CallOptions, run_project
     from pipeline.results.manifest import anchor, anchor_words
     from pipeline.show.progress import show_summary, summary_answer, watches
-    from pipeline.show.terminal import how_far
+    from pipeline.show.terminal import progress_printer
 
     opened = open_project(project)
     options = opened.project.replay
     out = opened.place(opened.project.out)
     named = _options(opened.vehicle_file, opened.config_file)
     places = {"site": opened.place(opened.project.site), "options": named, **opened.message_words}
-    pages = None if quiet or as_json else how_far("pages")
+    pages = None if quiet or as_json else progress_printer("pages")
     at_once = (options.jobs if jobs is None else jobs) or os.cpu_count() or 1
     call = CallOptions(_steps(quiet, as_json), watches(quiet, as_json), pages, at_once, force, prune)
     try:
@@ -443,14 +443,14 @@ def safety(
     """
     if out is not None:
         from pipeline.campaign.again import replay_again
-        from pipeline.show.assessment import show
+        from pipeline.show.assessment import show_assessment
         from pipeline.show.progress import progress_watch
         from pipeline.studies.safety.assessment import assess
 
         again = replay_again(logs or [], site, _vehicle(vehicle), jobs, progress_watch)
         with _telling("runs of several solutions"):
             found = assess(out, None if config is None else _configuration(config), again)
-        show(found, as_json)
+        show_assessment(found, as_json)
         return
     from pipeline.show.terminal import show_tables
     from pipeline.studies.safety import safety_tables
@@ -475,21 +475,20 @@ def claim(
 ) -> None:
     """Compare a result with published requirements for train localisation: met, not met or not shown."""
     from pipeline.results.answer_files import write_csv
-    from pipeline.studies.claim import claim as hold
-    from pipeline.studies.claim import for_reading, load_profile, read_areas
+    from pipeline.studies.claim import assess_claim, load_profile, read_areas, rows_for_reading
 
     wanted = load_profile(profile)
     ground = _ground(site, _used(out)) if site else None
     areas = read_areas(site, ground) if site and ground else None
     with _telling("runs"):
-        found = hold(out, wanted, ground, areas, front_ahead)
+        found = assess_claim(out, wanted, ground, areas, front_ahead)
     if csv is not None:
         write_csv(found.table, csv)
     if as_json or str(csv) != "-":
         head = {"profile": wanted.name, "version": wanted.version, "sources": list(wanted.sources)}
         title = f"{wanted.name}, version {wanted.version}: {'; '.join(wanted.sources)}"
         answer = {**head, "notes": found.notes, "requirements": found.table}
-        _tell(as_json, answer, {title: for_reading(found)}, "", *found.notes)
+        _tell(as_json, answer, {title: rows_for_reading(found)}, "", *found.notes)
 
 
 @_command(
@@ -512,7 +511,7 @@ def inspect(
     from pipeline.show.kinds import Kind, kind_at
 
     kind = kind_at(path)  # what is mistyped is said before anything is loaded
-    from pipeline.show.inspection import inspect_path, show
+    from pipeline.show.inspection import inspect_path, show_inspection
 
     settings = _configuration(config)
     if kind is Kind.RAW:
@@ -522,7 +521,7 @@ def inspect(
         tables = inspect_raw(Path(path), settings, ground, _vehicle(vehicle))
     else:
         tables = inspect_path(path, settings, result, site, _vehicle(vehicle))
-    _print_json(tables) if as_json else show(tables)
+    _print_json(tables) if as_json else show_inspection(tables)
     raise Exit(RUNS_NOT_OK if "Problems" in tables else OK)
 
 
@@ -797,7 +796,7 @@ def report(
 
     Pages of runs that have not changed since the last report are left as they are.
     """
-    from pipeline.results.packs import steady
+    from pipeline.results.packs import read_twice_if_moved
     from pipeline.show.report import write_against, write_page, write_report
 
     ground = _ground(site, _used(out)) if site else None
@@ -808,7 +807,7 @@ def report(
         return write_report(out, ground, jobs, most) if run is None else [write_page(out, run, ground, most)]
 
     with _telling("pages", quiet):
-        pages = steady(written)
+        pages = read_twice_if_moved(written)
     if as_json or not quiet:
         _tell(as_json, {"page": pages[0], "files": pages}, {}, f"{len(pages)} files; begin with {pages[0]}")
 
@@ -865,13 +864,13 @@ def export(
     project: OfProject = None,
 ) -> None:
     """Export one run with its results to MCAP viewers (Foxglove, Lichtblick, Rerun) or maps."""
-    from pipeline.results.packs import steady
+    from pipeline.results.packs import read_twice_if_moved
     from pipeline.show.export import export_run
 
     recorded = _log(log, _configuration(config), True) if log else None
     ground = _ground(site, _used(out)) if site else None
     layout: Literal["ros", "foxglove"] = "ros" if ros else "foxglove"
-    files, missing = steady(lambda: export_run(out, run, to, ground, recorded, layout))
+    files, missing = read_twice_if_moved(lambda: export_run(out, run, to, ground, recorded, layout))
     words = ["Wrote " + " and ".join(map(str, files)), *(f"Without {text}" for text in missing)]
     _tell(as_json, {"files": files, "missing": missing}, {}, *words)
 
@@ -893,19 +892,19 @@ def verify(
     project: OfProject = None,
 ) -> None:
     """Check a result against its manifest; with --logs, replay the logs again and compare every table."""
-    from pipeline.campaign.verify import as_kept, recompute
     from pipeline.campaign.verify import verify as compare
+    from pipeline.campaign.verify import verify_by_replay, verify_manifest
     from pipeline.results.manifest import anchor, anchor_words
     from pipeline.show.progress import progress_watch
 
-    found = [as_kept(out, expect)] if expect else []
+    found = [verify_manifest(out, expect)] if expect else []
     with _telling("runs", quiet):
         found.append(compare(out))
     if logs:
         settings = _configuration(config) if config else None
         shown = [] if quiet else [progress_watch()]
         found += _from_raw_logs(logs, project)
-        found.append(recompute(out, logs, site, settings, _vehicle(vehicle), route, jobs, shown))
+        found.append(verify_by_replay(out, logs, site, settings, _vehicle(vehicle), route, jobs, shown))
     if as_json:
         compared = [{"compared": v.compared, "not_compared": v.not_compared, "problems": v.table} for v in found]
         digest, runs = anchor(out)
@@ -982,7 +981,7 @@ def diff(
         _print_json(found.as_dict())
     else:
         print(visible(found.text(detail)))
-    raise Exit(OK if found.same else RUNS_NOT_OK)
+    raise Exit(OK if found.is_same else RUNS_NOT_OK)
 
 
 def main() -> None:
@@ -1097,9 +1096,9 @@ def _show(table: pl.DataFrame, title: str = "") -> None:
 def _telling(things: str, quiet: bool = False) -> contextlib.AbstractContextManager[None]:
     """Say on standard error how many of how many of these things are done, and how long the others will take."""
     from pipeline.results.workers import watched
-    from pipeline.show.terminal import how_far
+    from pipeline.show.terminal import progress_printer
 
-    return watched(None if quiet else how_far(things))
+    return watched(None if quiet else progress_printer(things))
 
 
 def _tell(as_json: bool, value: Any, tables: Mapping[str, pl.DataFrame], *words: str) -> None:

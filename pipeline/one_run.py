@@ -16,7 +16,7 @@ from pipeline.stages.prepare import PreparedRun, prepare
 from pipeline.stages.run_row.lost_time import lost_columns
 from pipeline.stages.run_row.summary import SolutionResults, failed_row, replay_notes, summarise
 from pipeline.studies.plausibility.fit import Fit, accuracy_checks, clock_advice, refuted, required_fit, with_checks
-from pipeline.studies.undetected.columns import Undetected, unnoticed_of
+from pipeline.studies.undetected.columns import Undetected, largest_unnoticed
 from schemas.config import Configuration, Vehicle
 from schemas.conform import shaped
 from schemas.enums import Reason
@@ -124,7 +124,7 @@ def _of_solution(prepared: PreparedRun, solution: str, channel: Channel, evidenc
     """
     fit, matches = _fitted(prepared, solution, channel)
     monitored = monitor_solution(prepared, solution, matches, evidence)
-    unnoticed = unnoticed_of(monitored)
+    unnoticed = largest_unnoticed(monitored)
     judged = judge(_case(monitored, unnoticed, evidence, fit.leaps_s(evidence.shares_odometer_clock)))
     results = _results(monitored, judged, unnoticed, fit, evidence)
     suspect = pl.Series("suspect_after_the_fact", judged.suspect_after_the_fact)

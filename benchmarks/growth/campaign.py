@@ -82,7 +82,7 @@ def _thousand(folder: Path) -> list[Figure]:
         Figure("damaged logs not reported", damaged - summary.count(RunStatus.FAILED), "runs", 0),
         Figure("other runs not ok", THOUSAND - damaged - summary.count(RunStatus.OK), "runs", 0),
         Figure("the same again, all complete", again.seconds, "s"),
-        Figure("of these replayed again", THOUSAND - resumed.skipped, "runs", 0),
+        Figure("of these replayed again", THOUSAND - resumed.count_skipped, "runs", 0),
     ]
 
 
@@ -139,7 +139,7 @@ def _resumed(folder: Path) -> list[Figure]:
     return [
         Figure("five thousand complete runs, looked into", seconds[0], "s"),
         Figure("five thousand complete runs, known", seconds[1], "s", RESUME_S),
-        Figure("of these replayed again", FIVE_THOUSAND - resumed.skipped, "runs", 0),
+        Figure("of these replayed again", FIVE_THOUSAND - resumed.count_skipped, "runs", 0),
     ]
 
 

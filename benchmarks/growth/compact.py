@@ -51,7 +51,7 @@ def measure(folder: Path, count: int = MANY) -> list[Figure]:
         with processor_time() as watch:
             resumed = run_campaign(plan, jobs=2)
         figures.append(Figure(f"{count} complete runs called, {name}", watch.seconds, "s", RESUME_S))
-        figures.append(Figure("of these replayed again", count - resumed.skipped, "runs", 0))
+        figures.append(Figure("of these replayed again", count - resumed.count_skipped, "runs", 0))
     for question, sql in _QUERIES.items():
         with processor_time() as watch:
             run_sql(folder / "many", sql)
@@ -90,7 +90,7 @@ def _many(folder: Path, log: Path, count: int) -> Plan:
     """The result of so many runs in packs, with what a campaign keeps of them; and its plan."""
     out = folder / "many"
     names = [f"r{number:05}" for number in range(count)]
-    recorded, tables = packing._recorded(str(folder / "few"), "one")
+    recorded, tables = packing._read_own_files(str(folder / "few"), "one")
     metadata = recorded.metadata
     listed = []
     for first in range(0, count, packing.RUNS_PER_PACK):
@@ -108,7 +108,7 @@ def _many(folder: Path, log: Path, count: int) -> Plan:
     # Files that were linked just now count as written just now.
     WAITS.settled_s = 0.0
     proofs = {job.run_id: resume.proof_of(job, storage.signature(Path(job.address))) for job in plan.jobs}
-    resume.keep(plan, [replace(outcome, run_id=name, proof=proof) for name, proof in proofs.items()])
+    resume.keep_outcomes(plan, [replace(outcome, run_id=name, proof=proof) for name, proof in proofs.items()])
     return plan
 
 

@@ -23,7 +23,7 @@ from datasets.experiment.monte_carlo import BLOCK_EPOCHS, ExperimentPlan, bank_f
 from datasets.experiment.range_system import RangePlan, range_system
 from datasets.experiment.sampling import Probability, missed_detection_probability
 from datasets.experiment.workers import generator
-from pipeline.results.workers import mapped
+from pipeline.results.workers import map_in_processes
 
 _NORMALS = 15
 _CHUNK = 256
@@ -49,7 +49,7 @@ def measure(folder: Path) -> list[Figure]:
     """The figures of the experiment; nothing is written but the folder."""
     folder.mkdir(parents=True, exist_ok=True)
     figures = []
-    for name, (drawing, grid) in zip(CONSTELLATIONS, mapped(_one_chunk, CONSTELLATIONS, _JOBS), strict=True):
+    for name, (drawing, grid) in zip(CONSTELLATIONS, map_in_processes(_one_chunk, CONSTELLATIONS, _JOBS), strict=True):
         figures += [
             Figure(f"{name}: normals of {_CHUNK} runs", drawing, "s"),
             Figure(f"{name}: grid of {_CHUNK} runs", grid, "s"),

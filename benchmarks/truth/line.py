@@ -14,7 +14,7 @@ from pipeline.read.site.read import read_site
 from pipeline.results.store import read_table
 from pipeline.studies.line.classes import piece_classes
 from pipeline.studies.line.passes import PieceIndex
-from pipeline.studies.line.pieces import middles, pieces_of
+from pipeline.studies.line.pieces import middles_in_plane_m, pieces_of
 from pipeline.studies.line.study import passes_of_runs, study_line
 from schemas.config import Configuration, settings_from
 from schemas.line import LineCriteria
@@ -161,7 +161,7 @@ def _predicted(out: Path) -> Figure:
     """Pieces whose share of losses over one half of the runs lies outside the exact bounds of the other half."""
     site, criteria = read_site(out / "trial" / "site"), LineCriteria()
     ground_pieces = pieces_of(site, criteria.piece_m)
-    ground = PieceIndex.of(site, ground_pieces, middles(site, ground_pieces))
+    ground = PieceIndex.of_pieces(site, ground_pieces, middles_in_plane_m(site, ground_pieces))
     runs = read_table(out / "tables", "runs").collect().sort("run_id")
     passes, undetected = passes_of_runs(out / "tables", runs, ground, criteria)
     number = pl.col("run_id").str.slice(1).cast(pl.Int64)

@@ -18,7 +18,6 @@ from typing import Any
 
 import numpy as np
 import polars as pl
-from schemas.monitors import MONITORS
 
 from benchmarks.results import Figure
 from datasets.faults import FaultKind, FaultSpec
@@ -28,10 +27,11 @@ from datasets.scenario import Scenario
 from datasets.trial import build_run, build_site
 from pipeline.one_run import monitor_alone, replay
 from pipeline.stages.monitored import MonitoredSolution
-from pipeline.studies.undetected.columns import rows_of, windows_of
+from pipeline.studies.undetected.columns import fault_windows, watched_rows
 from pipeline.studies.undetected.profile import FaultProfile, profile_at
 from schemas.arrays import floats, times_ns
 from schemas.config import Configuration, Vehicle
+from schemas.monitors import MONITORS
 from schemas.run import RunLog, Site
 
 RUNS = 200
@@ -195,8 +195,8 @@ def proof(seed: int, curved: bool, folder: Path) -> Outcome | None:
 
 
 def _some_epoch(monitored: MonitoredSolution, rng: np.random.Generator) -> int | None:
-    rows = rows_of(monitored)
-    parts = windows_of(monitored, rows)
+    rows = watched_rows(monitored)
+    parts = fault_windows(monitored, rows)
     if not parts:
         return None
     chosen = parts[int(rng.integers(len(parts)))]

@@ -124,8 +124,8 @@ def bank_figures(
             sigmas, rng = along_sigmas_m(sky, heading), np.random.default_rng([9, repetition, int(heading)])
             size = _WARM_S + 60 * minutes[-1] + 1
             rows = watched_of(noise_of(sigmas, size, rng), sigmas, alphas)
-            seen = _with_doppler(rows.since(_WARM_S, size - 1)) if velocity else rows.since(_WARM_S, size - 1)
-            both = [largest_errors(one, Configuration().undetected).most_m for one in (seen, seen.mirrored())]
+            seen = _with_doppler(rows.after_fix(_WARM_S, size - 1)) if velocity else rows.after_fix(_WARM_S, size - 1)
+            both = [largest_errors(one, Configuration().undetected).most_m for one in (seen, seen.in_other_direction())]
             larger.append(np.maximum(*both))
     median = np.median(larger, axis=0)
     beyond = np.flatnonzero(median > 20.0)
@@ -159,8 +159,10 @@ def shape_figures(constellation: Constellation, repetitions: int, minutes: tuple
                 sigmas, rng = along_sigmas_m(sky, heading), np.random.default_rng([9, repetition, int(heading)])
                 rows = watched_of(noise_of(sigmas, _WARM_S + 60 * minutes[-1] + 1, rng), sigmas, alphas)
                 ends = [_WARM_S + 60 * minute for minute in minutes]
-                both = (rows, rows.mirrored())
-                larger.append([max(largest_of_shape(one.since(_WARM_S, end), shape) for one in both) for end in ends])
+                both = (rows, rows.in_other_direction())
+                larger.append(
+                    [max(largest_of_shape(one.after_fix(_WARM_S, end), shape) for one in both) for end in ends]
+                )
         median = np.median(larger, axis=0)
         figures.append(
             {"sky": constellation, "shape": shape} | {f"{m} min": v for m, v in zip(minutes, median, strict=True)}
@@ -180,7 +182,7 @@ def ramp_figures(draws: int) -> list[dict[str, object]]:
     sigmas, steepest = along_sigmas_m(sky, float(sky.azimuth_deg[sky.faulty]) + heading), []
     for draw in range(draws):
         noise = noise_of(sigmas, _WARM_S + seconds + 1, np.random.default_rng([11, draw]))
-        window = watched_of(noise, sigmas, alphas).since(_WARM_S, _WARM_S + seconds)
+        window = watched_of(noise, sigmas, alphas).after_fix(_WARM_S, _WARM_S + seconds)
         steepest.append(largest_of_shape(window, "ramp", np.array([1])) / seconds)
     # The bank of the draws has run for as long since its restart.
     bank = linear_bank(sky, heading, BankSpec(alphas=(1.0, *alphas.tolist()), age_s=float(_WARM_S)))

@@ -12,7 +12,6 @@ from functools import partial
 
 import numpy as np
 import polars as pl
-from schemas.monitors import MONITORS
 
 from datasets.experiment.catalogue_faults import CatalogueFault, Journey, catalogue
 from datasets.experiment.catalogue_report import catalogue_page, faults_table, monitors_table
@@ -22,10 +21,11 @@ from datasets.motion import build_motion
 from datasets.scenario import Scenario
 from datasets.trial import build_run, build_site
 from pipeline.one_run import replay
-from pipeline.results.workers import mapped
+from pipeline.results.workers import map_in_processes
 from schemas.config import Configuration, Vehicle
 from schemas.frozen import frozen
 from schemas.inputs import BaliseReads
+from schemas.monitors import MONITORS
 from schemas.run import RunLog, RunTables, Site
 
 REPETITIONS = 40
@@ -196,7 +196,7 @@ def run_catalogue(
     journeys = dict.fromkeys(one.journey for one in faults)
     tasks = [(journey, number) for journey in journeys for number in range(repetitions)]
     replayed = partial(_replayed, tuple(faults), seed, compared(config or Configuration()))
-    rows = [row for part in mapped(replayed, tasks, jobs) for row in part]
+    rows = [row for part in map_in_processes(replayed, tasks, jobs) for row in part]
     order = {one.name: place for place, one in enumerate(faults)}
     rows.sort(key=lambda row: (order[str(row["fault"])], row["repetition"]))
     return pl.DataFrame(rows, infer_schema_length=None, schema_overrides=_NULLABLE)

@@ -10,7 +10,18 @@ import polars as pl
 
 from datasets.experiment.bank import READINGS, SENSORS
 from datasets.experiment.geometry import CONSTELLATIONS
-from pipeline.show.svg_plot import COLOURS, HEIGHT, WIDTH, Axis, Curve, both_ways_log, even_ticks, plot, svg, text
+from pipeline.show.svg_plot import (
+    COLOURS,
+    HEIGHT,
+    WIDTH,
+    Axis,
+    Curve,
+    even_ticks,
+    plot,
+    svg,
+    svg_text,
+    symmetric_log_scale,
+)
 
 _NAMES = {"gps": "GPS", "gps_galileo": "GPS + Galileo"}
 _SENSOR_NAMES = {"odometer": "odometer only", "odometer_and_track": "with track"}
@@ -43,7 +54,9 @@ def pmd_plot(title: str, curves: Sequence[Curve]) -> str:
     times_s = [time_s for curve in curves for time_s, _ in curve.points]
     low, high = min([-1.0, *times_s]), max([1.0, *times_s])
     ticks = [tick for tick in _TIMES_S if low <= tick <= high]
-    times = Axis("time since failure T_dsf [s], linear about 0, logarithmic beyond", low, high, ticks, both_ways_log)
+    times = Axis(
+        "time since failure T_dsf [s], linear about 0, logarithmic beyond", low, high, ticks, symmetric_log_scale
+    )
     return plot(title, times, Axis("Pmd", 0.0, 1.0, (0.0, 0.2, 0.4, 0.6, 0.8, 1.0)), curves)
 
 
@@ -91,14 +104,14 @@ def _since_figure(detection: pl.DataFrame, rate_mps: float) -> str:
 def _sky_figure(geometry: pl.DataFrame, constellation: str) -> str:
     """Azimuth clockwise from north, elevation from the rim to the zenith."""
     x0, y0 = WIDTH / 2, HEIGHT / 2
-    parts = [text(x0, y0 - _HORIZON - 6, "N", "middle")]
+    parts = [svg_text(x0, y0 - _HORIZON - 6, "N", "middle")]
     for elevation_deg in (0.0, 30.0, 60.0):
         radius = _HORIZON * (1.0 - elevation_deg / 90.0)
         parts.append(f'<circle cx="{x0}" cy="{y0}" r="{radius:.1f}" fill="none" stroke="#dddddd"/>')
-        parts.append(text(x0 + 3, y0 - radius + 14, f"{elevation_deg:g}°"))
+        parts.append(svg_text(x0 + 3, y0 - radius + 14, f"{elevation_deg:g}°"))
     for row in geometry.filter(constellation=constellation).iter_rows(named=True):
         radius, azimuth = _HORIZON * (1.0 - row["elevation_deg"] / 90.0), radians(row["azimuth_deg"])
         x, y = x0 + radius * sin(azimuth), y0 - radius * cos(azimuth)
         colour = "#c00000" if row["faulty"] else COLOURS[0]
-        parts += [f'<circle cx="{x:.1f}" cy="{y:.1f}" r="4" fill="{colour}"/>', text(x + 6, y - 4, row["sv"])]
+        parts += [f'<circle cx="{x:.1f}" cy="{y:.1f}" r="4" fill="{colour}"/>', svg_text(x + 6, y - 4, row["sv"])]
     return svg(f"The sky: {_NAMES[constellation]}", HEIGHT, parts)

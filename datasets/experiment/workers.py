@@ -8,7 +8,7 @@ from typing import TypeVar
 
 import numpy as np
 
-from pipeline.results.workers import mapped
+from pipeline.results.workers import map_in_processes
 
 T = TypeVar("T")
 
@@ -27,7 +27,7 @@ def in_pieces(
     work: Callable[[int, np.random.Generator], T], total: int, size: int, key: tuple[int, ...], jobs: int
 ) -> list[T]:
     """`work` of every block of `total` runs, each with a stream of its own: the same for any number of jobs."""
-    return mapped(partial(_piece, work, key), list(enumerate(in_blocks(total, size))), jobs)
+    return map_in_processes(partial(_piece, work, key), list(enumerate(in_blocks(total, size))), jobs)
 
 
 def _piece(work: Callable[[int, np.random.Generator], T], key: tuple[int, ...], block: tuple[int, int]) -> T:

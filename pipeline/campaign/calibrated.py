@@ -13,13 +13,13 @@ from typing import TYPE_CHECKING
 from pipeline.campaign.plan import Plan, RunJob, find_runs, site_at
 from pipeline.campaign.recorded_log import RecordedLog
 from pipeline.read.site.route import with_route
-from pipeline.results.workers import mapped
+from pipeline.results.workers import map_in_processes
 from schemas.config import Configuration, digest_of
 from schemas.errors import BaliseError, InputError, UsageError
 from schemas.frozen import frozen
 
 if TYPE_CHECKING:
-    from pipeline.studies.calibration.calibrate import Observed
+    from pipeline.studies.calibration.calibrate import ObservedRun
 
 AUTO = "auto"
 
@@ -30,11 +30,11 @@ class _CalibrationRun:
 
     run_id: str
     content: str = ""
-    observed: Observed | None = None
+    observed: ObservedRun | None = None
     reason: str = ""
 
 
-def calibrated(plan: Plan, runs: Sequence[str], jobs: int = 1) -> Plan:
+def calibrate_plan(plan: Plan, runs: Sequence[str], jobs: int = 1) -> Plan:
     """The plan with vehicle, noise and sigmas of each run as measured on the given runs.
 
     `runs`: paths, globs and folders, or `auto`: the runs of the plan itself that raise no alarm beyond their noise.
@@ -42,7 +42,7 @@ def calibrated(plan: Plan, runs: Sequence[str], jobs: int = 1) -> Plan:
     are of different vehicles.
     """
     automatic = list(runs) == [AUTO]
-    sources = mapped(_source, _jobs_of(plan, runs, automatic), jobs)
+    sources = map_in_processes(_observe_job, _jobs_to_observe(plan, runs, automatic), jobs)
     refused = "; ".join(f"{source.run_id}: {source.reason}" for source in sources if source.reason)
     if refused and not automatic:
         raise UsageError("cannot calibrate", place="--calibrate", found=refused, expected="fault-free runs")
@@ -57,14 +57,14 @@ def calibrated(plan: Plan, runs: Sequence[str], jobs: int = 1) -> Plan:
         names = tuple(source.run_id for source in others)
         if names not in made:
             _require_enough(job, len(others), refused)
-            made[names] = _calibrated(job, others)
+            made[names] = _calibrate_job(job, others)
         like = made[names]
         finished.append(replace(job, config=like.config, vehicle=like.vehicle, config_digest=like.config_digest))
     whole = plan if len(made) != 1 else replace(plan, config=finished[0].config, vehicle=finished[0].vehicle)
     return replace(whole, jobs=tuple(finished))
 
 
-def _jobs_of(plan: Plan, runs: Sequence[str], automatic: bool) -> list[RunJob]:
+def _jobs_to_observe(plan: Plan, runs: Sequence[str], automatic: bool) -> list[RunJob]:
     """The runs to observe, as jobs on the plan's site."""
     if automatic:
         return list(plan.jobs)
@@ -76,17 +76,19 @@ def _jobs_of(plan: Plan, runs: Sequence[str], automatic: bool) -> list[RunJob]:
     return [replace(model, run_id=run_id, address=address) for run_id, address in addresses.items()]
 
 
-def _source(job: RunJob) -> _CalibrationRun:
+def _observe_job(job: RunJob) -> _CalibrationRun:
     """What a run shows, or why it shows nothing; no error of a log ends the campaign here."""
-    from pipeline.studies.calibration.calibrate import observe  # replays, which the parent of a campaign need not load
+    from pipeline.studies.calibration.calibrate import (
+        observe_run,  # replays, which the parent of a campaign need not load
+    )
 
     log = RecordedLog(job)
     try:
-        with log.here() as path:
+        with log.local_copy() as path:
             run = log.read(path)
         site = site_at(job.site, job.site_digest, job.config.site)
         site = with_route(site, job.route, job.config.site) if job.route else site
-        observed = observe(run, site, job.vehicle, job.config, run.main_solution())
+        observed = observe_run(run, site, job.vehicle, job.config, run.main_solution())
     except InputError as error:
         return _CalibrationRun(job.run_id, log.digest, reason=str(error))
     if observed.estimate is None:
@@ -96,13 +98,13 @@ def _source(job: RunJob) -> _CalibrationRun:
     return _CalibrationRun(job.run_id, log.digest, observed)
 
 
-def _calibrated(job: RunJob, sources: Sequence[_CalibrationRun]) -> RunJob:
+def _calibrate_job(job: RunJob, sources: Sequence[_CalibrationRun]) -> RunJob:
     """The job with the calibration that other fault-free runs give."""
-    from pipeline.studies.calibration.calibrate import calibration_of
+    from pipeline.studies.calibration.calibrate import combine_runs
 
     observed = [source.observed for source in sources if source.observed is not None]
     try:
-        calibration = calibration_of(observed, job.vehicle, job.config)
+        calibration = combine_runs(observed, job.vehicle, job.config)
     except BaliseError as error:
         raise UsageError(error.message, place=error.place, found=error.found, remedy=error.remedy) from None
     names = tuple(source.run_id for source in sources)

@@ -33,8 +33,10 @@ class LostWorkerError(Exception):
 
 
 class DaskEngine(Engine):
+    """Workers of a Dask cluster that exists."""
+
     def __init__(self, scheduler: str, limit_s: float) -> None:
-        self._client = _connect(scheduler)
+        self._client = _connect_client(scheduler)
         self._limit_s = limit_s
         self._threads = 0
         self._counted_s = -WAITS.count_every_s
@@ -42,24 +44,24 @@ class DaskEngine(Engine):
         self.name = redacted(scheduler)
         self._tasks: dict[Result, Any] = {}
         self._workers: dict[str, str] = {}
-        self._client.subscribe_topic(_BEGUN, self._note)
+        self._client.subscribe_topic(_BEGUN, self._note_begin)
 
     def capacity(self) -> int:
         """Twice the cluster's threads, so that no worker waits for the next run."""
         if time.monotonic() - self._counted_s > WAITS.count_every_s:
-            self._threads = self._count()
+            self._threads = self._count_threads()
             self._counted_s = time.monotonic()
             if self._threads:
                 self._seen_s = self._counted_s
         return max(1, 2 * self._threads)
 
-    def lonely_s(self) -> float:
+    def time_without_worker_s(self) -> float:
         """Time for which there has been no worker [s]."""
         return 0.0 if self._threads else time.monotonic() - self._seen_s
 
     def submit(self, job: RunJob) -> Result:
         """Hand a run to the cluster; the result is set when its task ends, however that was."""
-        task = self._client.submit(replay_there, job, self._limit_s + WAITS.grace_s, pure=False)
+        task = self._client.submit(replay_on_cluster, job, self._limit_s + WAITS.grace_s, pure=False)
         result: Result = Future()
         self._tasks[result] = task
         self._client.loop.add_callback(passed_on, self._client, task, result)
@@ -71,13 +73,13 @@ class DaskEngine(Engine):
         if key in self._workers or not result.done():
             return key in self._workers
         with contextlib.suppress(Exception):
-            return bool(self._ask(self._client.scheduler.event_is_set, name=key))
+            return bool(self._ask_scheduler(self._client.scheduler.event_is_set, name=key))
         return True
 
     def kill(self, result: Result) -> None:
         """End the worker that has the run, through its nanny, without waiting for that."""
         task = self._tasks[result]
-        threading.Thread(target=self._end, args=(task, self._workers.get(task.key, "")), daemon=True).start()
+        threading.Thread(target=self._end_worker, args=(task, self._workers.get(task.key, "")), daemon=True).start()
 
     def is_lost_worker(self, error: BaseException) -> bool:
         """Whether an error means that the worker died."""
@@ -85,24 +87,24 @@ class DaskEngine(Engine):
 
         return isinstance(error, LostWorkerError | KilledWorker)
 
-    def collected(self, result: Result) -> None:
+    def forget_result(self, result: Result) -> None:
         """Forget a task whose result has been taken."""
         key = self._tasks.pop(result).key
         self._workers.pop(key, None)
         if self._client.status == "running":
             with contextlib.suppress(Exception):
-                self._ask(self._client.scheduler.event_clear, name=key)
+                self._ask_scheduler(self._client.scheduler.event_clear, name=key)
 
     def close(self) -> None:
         """Leave the cluster; its workers stay."""
         with contextlib.suppress(Exception):
             self._client.close(timeout=1)
 
-    def _note(self, event: tuple[float, dict[str, str]]) -> None:
+    def _note_begin(self, event: tuple[float, dict[str, str]]) -> None:
         """A worker has begun a run, of this campaign or of another one on the same cluster."""
         self._workers[event[1]["key"]] = event[1]["worker"]
 
-    def _end(self, task: Any, worker: str) -> None:
+    def _end_worker(self, task: Any, worker: str) -> None:
         """End the worker of a run, begin it anew, and give up the run."""
         with contextlib.suppress(Exception):
             self._client.sync(
@@ -116,21 +118,21 @@ class DaskEngine(Engine):
         # It would be handed out again.
         task.cancel()
 
-    def _ask(self, question: Any, **arguments: str) -> Any:
+    def _ask_scheduler(self, question: Any, **arguments: str) -> Any:
         """Ask the scheduler, which must answer within a time."""
         return self._client.sync(question, callback_timeout=WAITS.scheduler_answer_s, **arguments)
 
-    def _count(self) -> int:
+    def _count_threads(self) -> int:
         """Threads of all workers; where the scheduler is silent, but not for ever, those that there were."""
         try:
             if self._client.status != "running":
                 raise ConnectionError
-            threads: int = sum(self._ask(self._client.scheduler.ncores).values())
+            threads: int = sum(self._ask_scheduler(self._client.scheduler.ncores).values())
         except Exception as error:
             unanswered_s = time.monotonic() - self._heard_s
             if isinstance(error, TimeoutError) and unanswered_s < WAITS.lonely_s:
                 return self._threads
-            raise lost_scheduler(self.name) from error
+            raise lost_scheduler_error(self.name) from error
         self._heard_s = time.monotonic()
         return threads
 
@@ -149,7 +151,7 @@ async def passed_on(client: Any, task: Any, result: Result) -> None:
         result.set_result(outcome)
 
 
-def replay_there(job: RunJob, limit_s: float) -> RunOutcome:
+def replay_on_cluster(job: RunJob, limit_s: float) -> RunOutcome:
     """What a worker does: the run, unless another worker had begun it and was lost.
 
     The campaign ends the workers of runs that take too long. Where it cannot, because it is gone itself or has no way
@@ -159,13 +161,13 @@ def replay_there(job: RunJob, limit_s: float) -> RunOutcome:
     timer.daemon = True
     timer.start()
     try:
-        _begin()
+        _announce_task()
         return replay_one(job)
     finally:
         timer.cancel()
 
 
-def _begin() -> None:
+def _announce_task() -> None:
     """Leave the mark of this task at the scheduler, and tell the campaign where it is."""
     from distributed import get_worker
     from distributed.utils import sync
@@ -178,7 +180,7 @@ def _begin() -> None:
     worker.log_event(_BEGUN, {"key": key, "worker": worker.address})
 
 
-def lost_scheduler(scheduler: str) -> UsageError:
+def lost_scheduler_error(scheduler: str) -> UsageError:
     """The error for a scheduler that does not answer any more."""
     return UsageError(
         "the Dask scheduler does not answer",
@@ -187,18 +189,18 @@ def lost_scheduler(scheduler: str) -> UsageError:
     )
 
 
-def _connect(scheduler: str) -> Any:
+def _connect_client(scheduler: str) -> Any:
     """A client of the cluster. Somebody must answer first: a client that finds nobody takes 20 s more to close."""
     try:
         from distributed import Client
     except ImportError:
         raise UsageError("--scheduler needs Dask", remedy="Install `balise[cluster]`.") from None
-    _hush()
+    _silence_dask()
     try:
         asyncio.run(_answered(scheduler))
         return Client(scheduler, timeout=WAITS.scheduler_s, set_as_default=False)  # type: ignore[no-untyped-call]
     except (OSError, ValueError, TimeoutError):
-        raise lost_scheduler(scheduler) from None
+        raise lost_scheduler_error(scheduler) from None
 
 
 async def _answered(scheduler: str) -> None:
@@ -210,7 +212,7 @@ async def _answered(scheduler: str) -> None:
     await comm.close()
 
 
-def _hush() -> None:
+def _silence_dask() -> None:
     """Dask logs tracebacks of lost connections; the campaign says in one message what was lost."""
     for name in list(logging.root.manager.loggerDict):
         if name.partition(".")[0] in ("distributed", "tornado"):

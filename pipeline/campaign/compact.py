@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 
 from pipeline.campaign import resume
-from pipeline.campaign.lock import locked
+from pipeline.campaign.lock import hold_output
 from pipeline.results import packs, store
 from pipeline.results.manifest import write_manifest
 from pipeline.results.outcome import RunOutcome
@@ -39,34 +39,34 @@ def compact(out: Address, runs_per_pack: int = RUNS_PER_PACK, jobs: int = 1) -> 
     store.complete_runs(out)
     left_out: dict[str, str] = {}
     done = 0
-    with locked(out):
+    with hold_output(out):
         store.sweep(out)
-        known = {} if is_url(out) else resume.in_place(str(out))
+        known = {} if is_url(out) else resume.outcomes_in_place(str(out))
         for packed, total in pack_runs(out, runs_per_pack, jobs):
             left_out |= packed.left_out
             done += len(packed.runs) + len(packed.left_out)
             tell(done, total)
-        return _finished(out, left_out, known)
+        return _finish_compaction(out, left_out, known)
 
 
 def undo(out: Address) -> Compaction:
     """Give every run files of its own again, with the bytes that they had."""
     store.complete_runs(out)
-    total = len(packs.find(out))
+    total = len(packs.find_packed(out))
     done = 0
-    with locked(out):
+    with hold_output(out):
         store.sweep(out)
-        known = {} if is_url(out) else resume.in_place(str(out))
-        for runs in unpack(out, packs.listed(out)):
+        known = {} if is_url(out) else resume.outcomes_in_place(str(out))
+        for runs in unpack(out, packs.read_list(out)):
             done += runs
             tell(done, total)
-        return _finished(out, {}, known)
+        return _finish_compaction(out, {}, known)
 
 
-def _finished(out: Address, left_out: Mapping[str, str], known: Mapping[str, RunOutcome]) -> Compaction:
+def _finish_compaction(out: Address, left_out: Mapping[str, str], known: Mapping[str, RunOutcome]) -> Compaction:
     """Write what follows from where runs lie; `known`: outcomes of runs that need not be looked into again."""
     write_manifest(out)
     if known:
         resume.keep_in_place(str(out), known)
     own = len(store.own_runs(out))
-    return Compaction(len(store.run_ids(out)) - own, len(packs.listed(out)), own, left_out)
+    return Compaction(len(store.run_ids(out)) - own, len(packs.read_list(out)), own, left_out)

@@ -20,8 +20,8 @@ from tempfile import TemporaryDirectory
 from types import FrameType
 from typing import Any
 
-from pipeline.campaign.interruption import StopRun, answered
-from pipeline.campaign.outcome import NO_MEMORY, Result, RunFailure, overdue
+from pipeline.campaign.interruption import StopRun, handle_signals
+from pipeline.campaign.outcome import NO_MEMORY, Result, RunFailure, overdue_text
 from pipeline.campaign.plan import RunJob, keep_site, kept_sites
 from pipeline.campaign.waits import WAITS
 from pipeline.campaign.worker import fail_run, replay_one
@@ -60,11 +60,11 @@ class Engine:
         """Whether the error means that the worker died, not that the run failed."""
         return False
 
-    def lonely_s(self) -> float:
+    def time_without_worker_s(self) -> float:
         """Time for which there has been no worker to hand runs to [s]."""
         return 0.0
 
-    def collected(self, result: Result) -> None:
+    def forget_result(self, result: Result) -> None:
         """Forget a run whose result the campaign has taken."""
 
     def close(self) -> None:
@@ -83,10 +83,10 @@ class SerialEngine(Engine):
         """Replay a run here and now, within the time limit."""
         result: Result = Future()
         try:
-            with _alarm(self._limit_s):
+            with _time_limit(self._limit_s):
                 result.set_result(replay_one(job))
         except _Overdue:
-            result.set_result(fail_run(job, RunFailure(overdue(self._limit_s), lasting=False)))
+            result.set_result(fail_run(job, RunFailure(overdue_text(self._limit_s), lasting=False)))
         except Exception as error:
             result.set_exception(error)
         return result
@@ -97,13 +97,14 @@ class _Overdue(StopRun):
 
 
 @contextlib.contextmanager
-def _alarm(limit_s: float) -> Iterator[None]:
+def _time_limit(limit_s: float) -> Iterator[None]:
     """End what runs within this context once it takes too long."""
 
-    def ring(signum: int, frame: FrameType | None) -> None:
+    def end_run(signum: int, frame: FrameType | None) -> None:
+        """End the run: its time is over."""
         raise _Overdue
 
-    with answered([signal.SIGALRM], ring) as heard:
+    with handle_signals([signal.SIGALRM], end_run) as heard:
         if heard:
             signal.setitimer(signal.ITIMER_REAL, limit_s)
         try:
@@ -147,7 +148,7 @@ class LocalEngine(Engine):
         """Whether an error means that the worker died."""
         return isinstance(error, BrokenExecutor)
 
-    def collected(self, result: Result) -> None:
+    def forget_result(self, result: Result) -> None:
         """Make the worker of a run idle again."""
         slot = self._busy.pop(result)
         if _was_without_memory(result):
@@ -182,11 +183,11 @@ class _WorkerSlot:
         if self._runs > WAITS.runs_per_process:
             self.kill()
         with contextlib.suppress(BrokenExecutor):
-            return self._started().submit(replay_one, job)
+            return self._running_executor().submit(replay_one, job)
         # It died while it was idle: that costs no run.
         self.kill()
         try:
-            return self._started().submit(replay_one, job)
+            return self._running_executor().submit(replay_one, job)
         except BrokenExecutor as error:
             lost: Result = Future()
             lost.set_exception(error)
@@ -208,17 +209,17 @@ class _WorkerSlot:
         self._answer = None
         self._runs = 0
 
-    def _started(self) -> ProcessPoolExecutor:
+    def _running_executor(self) -> ProcessPoolExecutor:
         """The executor of the worker's process, begun anew if that process is gone."""
         if self._process is not None and not self._process.is_alive():
             self.kill()
         if self._executor is None:
             context = _KnownProcesses()
             self._executor = ProcessPoolExecutor(
-                1, mp_context=context, initializer=_begin_worker, initargs=(self._ground,)
+                1, mp_context=context, initializer=_initialise_worker, initargs=(self._ground,)
             )
             # Deaf to Ctrl-C from its start on: that is the parent's to answer, who hears it once the start is over.
-            with single_threaded_children(), _held_back(signal.SIGINT):
+            with single_threaded_children(), _delay_signal(signal.SIGINT):
                 self._answer = self._executor.submit(os.getpid)
             self._process = context.made[-1]
         return self._executor
@@ -237,10 +238,10 @@ class _KnownProcesses(SpawnContext):
 
 
 @contextlib.contextmanager
-def _held_back(signum: int) -> Iterator[None]:
+def _delay_signal(signum: int) -> Iterator[None]:
     """The signal reaches this thread after the block; processes that it starts never hear it."""
     if not hasattr(signal, "pthread_sigmask"):
-        with answered([signum], signal.SIG_IGN):
+        with handle_signals([signum], signal.SIG_IGN):
             yield
         return
     before = signal.pthread_sigmask(signal.SIG_BLOCK, [signum])
@@ -250,16 +251,16 @@ def _held_back(signum: int) -> Iterator[None]:
         signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
 
-def _begin_worker(ground: Path) -> None:
+def _initialise_worker(ground: Path) -> None:
     """Runs first in a worker: leave Ctrl-C to the parent, go when the parent goes, keep the sites of the parent."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
-    threading.Thread(target=_go_with_parent, daemon=True).start()
+    threading.Thread(target=_end_with_parent, daemon=True).start()
     sites: list[tuple[Site, SiteConfig]] = pickle.loads(ground.read_bytes())
     for site, config in sites:
         keep_site(site, config)
 
 
-def _go_with_parent() -> None:
+def _end_with_parent() -> None:
     """End a worker process when its parent ends."""
     parent = multiprocessing.parent_process()
     if parent is not None:

@@ -35,7 +35,7 @@ class Interrupted(StopRun):
 
 
 @contextmanager
-def answered(signals: Iterable[int], handler: Handler) -> Iterator[bool]:
+def handle_signals(signals: Iterable[int], handler: Handler) -> Iterator[bool]:
     """Let the handler answer these signals meanwhile; only the main thread can, which is what is given."""
     in_main = threading.current_thread() is threading.main_thread()
     before = {signum: signal.signal(signum, handler) for signum in signals if in_main}
@@ -47,16 +47,17 @@ def answered(signals: Iterable[int], handler: Handler) -> Iterator[bool]:
 
 
 @contextmanager
-def listening(heard: Callable[[int], None], at_once: bool) -> Iterator[None]:
+def listen_for_signals(heard: Callable[[int], None], at_once: bool) -> Iterator[None]:
     """Pass SIGINT, SIGTERM and SIGHUP on to `heard`; `at_once` also raises `Interrupted` where they arrive.
 
     What the caller ignores (`nohup`) is ignored.
     """
 
     def answer(signum: int, frame: FrameType | None) -> None:
+        """Pass a signal on."""
         heard(signum)
         if at_once:
             raise Interrupted(signum)
 
-    with answered([signum for signum in _STOPPING if signal.getsignal(signum) is not signal.SIG_IGN], answer):
+    with handle_signals([signum for signum in _STOPPING if signal.getsignal(signum) is not signal.SIG_IGN], answer):
         yield

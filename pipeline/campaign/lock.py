@@ -26,16 +26,16 @@ HELD = ".held"
 
 
 @contextlib.contextmanager
-def locked(out: Address) -> Iterator[str]:
+def hold_output(out: Address) -> Iterator[str]:
     """Hold the output for this campaign, under the name that is given. Raises `OutputError` while another holds it."""
     name = secrets.token_hex(8)
-    with _locked_remote(str(out), name) if is_url(out) else _locked_local(Path(out), name):
+    with _hold_remote(str(out), name) if is_url(out) else _hold_local(Path(out), name):
         yield name
 
 
 def check_held(out: Address, name: str) -> None:
     """Raises `OutputError` unless the campaign of this name still holds the output."""
-    if not _content(join(out, NAME)).startswith(name):
+    if not _read_lock(join(out, NAME)).startswith(name):
         raise OutputError(
             "is no longer held by this campaign",
             place=redacted(str(out)),
@@ -44,7 +44,7 @@ def check_held(out: Address, name: str) -> None:
 
 
 @contextlib.contextmanager
-def _locked_local(out: Path, name: str) -> Iterator[None]:
+def _hold_local(out: Path, name: str) -> Iterator[None]:
     """Hold the lock of a local folder of results."""
     held = FileLock(out / HELD)
     with storage.as_output_error(out):
@@ -52,7 +52,7 @@ def _locked_local(out: Path, name: str) -> Iterator[None]:
         try:
             held.acquire(blocking=False)
         except Timeout:
-            raise _busy(out) from None
+            raise _busy_error(out) from None
     try:
         storage.write_bytes(out / NAME, name.encode())
         yield
@@ -62,7 +62,7 @@ def _locked_local(out: Path, name: str) -> Iterator[None]:
 
 
 @contextlib.contextmanager
-def _locked_remote(out: str, name: str) -> Iterator[None]:
+def _hold_remote(out: str, name: str) -> Iterator[None]:
     """A lock object that its holder rewrites every few seconds.
 
     One that stays as it is for several beats belongs to a campaign that was killed. No clocks are
@@ -72,49 +72,49 @@ def _locked_remote(out: str, name: str) -> Iterator[None]:
     _wait_for_silence(place, out)
     storage.write_bytes(place, f"{name} 0".encode())
     time.sleep(WAITS.lock_beat_s / 4)
-    if not _content(place).startswith(name):
-        raise _busy(out)
+    if not _read_lock(place).startswith(name):
+        raise _busy_error(out)
     ended = threading.Event()
-    beat = threading.Thread(target=_beat, args=(place, name, ended), daemon=True)
+    beat = threading.Thread(target=_renew_lock, args=(place, name, ended), daemon=True)
     beat.start()
     try:
         yield
     finally:
         ended.set()
         beat.join()
-        if _content(place).startswith(name):
+        if _read_lock(place).startswith(name):
             storage.remove(place)
 
 
 def _wait_for_silence(place: str, out: str) -> None:
     """Wait until the holder of a lock must be gone; refuse if it renews the lock meanwhile."""
-    seen = _content(place)
+    seen = _read_lock(place)
     until = time.monotonic() + WAITS.lock_silence_s
     while seen and time.monotonic() < until:
         time.sleep(WAITS.lock_beat_s / 4)
-        now = _content(place)
+        now = _read_lock(place)
         if now and now != seen:
-            raise _busy(out)
+            raise _busy_error(out)
         seen = now
 
 
-def _content(place: Address) -> str:
+def _read_lock(place: Address) -> str:
     """What a lock says; empty if there is none."""
     return (storage.content_of(place) or b"").decode()
 
 
-def _beat(place: str, name: str, ended: threading.Event) -> None:
+def _renew_lock(place: str, name: str, ended: threading.Event) -> None:
     """Rewrite the lock until the end, or until a campaign that took this one for dead has taken it over."""
     count = 0
     while not ended.wait(WAITS.lock_beat_s):
         count += 1
         with contextlib.suppress(OutputError):
-            if not _content(place).startswith(name):
+            if not _read_lock(place).startswith(name):
                 return
             storage.write_bytes(place, f"{name} {count}".encode())
 
 
-def _busy(out: Address) -> OutputError:
+def _busy_error(out: Address) -> OutputError:
     """The error for results that another campaign is writing."""
     return OutputError(
         "another campaign is writing here",

@@ -42,17 +42,17 @@ class ChangedError(InputError):
     """The log was written to while it was read: trying again may succeed."""
 
 
-def changed(address: Address) -> ChangedError:
+def changed_error(address: Address) -> ChangedError:
     """The error for a log that changed while it was read."""
     return ChangedError("changed while it was read", place=str(address), remedy="Replay it again when it is complete.")
 
 
-def overdue(limit_s: float) -> str:
+def overdue_text(limit_s: float) -> str:
     """The error text of a run that took too long."""
     return f"took longer than the time limit of {limit_s:g} s"
 
 
-def lost(attempts: int) -> str:
+def lost_text(attempts: int) -> str:
     """The error text of a run whose workers died."""
     return (
         f"its worker died {attempts} times (killed, or out of memory). "
@@ -60,7 +60,7 @@ def lost(attempts: int) -> str:
     )
 
 
-def never_begun(workers: int) -> str:
+def never_begun_text(workers: int) -> str:
     """The error text of a run for which no worker came up."""
     return f"{workers} workers died before they started this run. See the logs of the workers."
 
@@ -68,7 +68,7 @@ def never_begun(workers: int) -> str:
 def failure_of(error: BaseException, lasting: bool) -> RunFailure:
     """A failure in words, and whether the same input would fail again."""
     if isinstance(error, BaliseError):
-        again = isinstance(error, InputError) and not isinstance(error, ChangedError) and not _is_of_the_machine(error)
+        again = isinstance(error, InputError) and not isinstance(error, ChangedError) and not _may_pass(error)
         return RunFailure(redacted(str(error)), lasting and again)
     if _lacks_memory(error):
         return RunFailure(NO_MEMORY, lasting=False)
@@ -88,7 +88,7 @@ def _lacks_memory(error: BaseException | None) -> bool:
     return False
 
 
-def _is_of_the_machine(error: BaseException | None) -> bool:
+def _may_pass(error: BaseException | None) -> bool:
     """A disk or a share that did not give the log may give it the next time; a file that is not there is the log's."""
     while error is not None:
         if isinstance(error, OSError) and error.errno is not None and not isinstance(error, FileNotFoundError):
@@ -97,7 +97,7 @@ def _is_of_the_machine(error: BaseException | None) -> bool:
     return False
 
 
-def worst(runs: pl.DataFrame) -> RunStatus:
+def worst_status(runs: pl.DataFrame) -> RunStatus:
     """The status of a run with several solutions: the worst of theirs."""
     statuses = set(runs["status"].cast(pl.String).to_list())
     return next((s for s in (RunStatus.FAILED, RunStatus.PARTIAL) if s.value in statuses), RunStatus.OK)
@@ -116,19 +116,19 @@ def outcome_of(
     rows = [row for row in runs.iter_rows(named=True) if verdict is not None and row["verdict"] == verdict.value]
     return RunOutcome(
         run_id=run_id,
-        status=worst(runs),
+        status=worst_status(runs),
         error=errors[0] if errors else None,
         verdict=verdict,
         hazards=sum(counts) if judged.height else None,
         missed_detections=missed if judged.height else None,
-        why=_why(rows, several=runs.height > 1),
+        why=_verdict_reasons(rows, several=runs.height > 1),
         faults=tuple(hazard_words(hazards, passages)),
         log=redacted(log),
-        **(_figures_of_verdict(rows[0], low) if rows else {}),
+        **(_verdict_figures(rows[0], low) if rows else {}),
     )
 
 
-def _figures_of_verdict(row: Mapping[str, Any], low: float) -> dict[str, Any]:
+def _verdict_figures(row: Mapping[str, Any], low: float) -> dict[str, Any]:
     """Figures next to the verdict, of the solution that heads the run."""
     figures = {name: row[name] for name in VERDICT_FIGURES}
     figures |= {name: tuple(row[name] or ()) for name in ("remedies", "remedies_gain")}
@@ -138,7 +138,7 @@ def _figures_of_verdict(row: Mapping[str, Any], low: float) -> dict[str, Any]:
     return figures | {"lost": lost_words(row["lost_to"], row["lost_to_share"], row["lost_to_monitor"], 1.0 - available)}
 
 
-def _why(rows: Sequence[Mapping[str, Any]], several: bool) -> str:
+def _verdict_reasons(rows: Sequence[Mapping[str, Any]], several: bool) -> str:
     """What decides the verdict, of each solution that has it; `several`: of several, so that they are named."""
     return "; ".join((f"{row['solution']}: " if several else "") + reason_words(row) for row in rows)
 

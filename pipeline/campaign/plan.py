@@ -9,7 +9,7 @@ from dataclasses import field, replace
 from pipeline import storage
 from pipeline.read.site.read import read_site, refuse_unrelated
 from pipeline.results import store
-from pipeline.results.manifest import SettingsFiles, listing, settings_files, unaltered
+from pipeline.results.manifest import SettingsFiles, file_list_text, settings_files, unaltered_metadata
 from pipeline.results.software import software_digest
 from pipeline.storage import files
 from pipeline.storage.address import Address, join, name_of, redacted, stem_of
@@ -135,7 +135,7 @@ def make_plan(
         address="",
         site=storage.absolute(site),
         site_digest=ground.digest,
-        site_files=listing(ground.files),
+        site_files=file_list_text(ground.files),
         config=config,
         vehicle=vehicle,
         out=storage.absolute(out),
@@ -171,11 +171,11 @@ def with_previous(plan: Plan, known: Collection[str] = ()) -> Plan:
     A run whose marker is not the one that its campaign wrote is not complete.
     """
     left = [job for job in plan.jobs if job.run_id not in known]
-    complete = unaltered(plan.out, [job.run_id for job in left])
+    complete = unaltered_metadata(plan.out, [job.run_id for job in left])
     return replace(plan, jobs=tuple(replace(job, previous=complete.get(job.run_id)) for job in left))
 
 
-def digests(job: RunJob, files_digest: str) -> dict[str, str]:
+def run_digests(job: RunJob, files_digest: str) -> dict[str, str]:
     """What decides a run's tables; equal digests mean equal tables, so that the run is skipped."""
     return {
         "config_digest": job.config_digest,
@@ -200,7 +200,7 @@ def find_runs(named: Iterable[str]) -> dict[str, str]:
     """
     addresses: dict[str, str] = {}
     for name in named:
-        for address in _expand(name):
+        for address in _logs_at(name):
             run_id = stem_of(address)
             _check_name(run_id, address)
             first = addresses.setdefault(run_id, storage.absolute(address))
@@ -227,7 +227,7 @@ def _check_name(run_id: str, address: Address) -> None:
         raise UsageError(reason, place=redacted(str(address)), remedy="Rename it: results are stored by run id.")
 
 
-def _expand(name: str) -> list[Address]:
+def _logs_at(name: str) -> list[Address]:
     """Logs at a place; what its name does not show to be no run is taken for one until it is read."""
     matches = storage.require_match(name)
     return [

@@ -10,7 +10,7 @@ from pathlib import Path
 import polars as pl
 
 from pipeline import storage
-from pipeline.campaign.outcome import changed
+from pipeline.campaign.outcome import changed_error
 from pipeline.campaign.plan import RunJob
 from pipeline.read.ingest import read_run
 from pipeline.results import catalogue, manifest
@@ -41,22 +41,22 @@ class RecordedLog:
         self._version = self._stored_version()
         if self._version is None or self._job.previous is None:
             return ""
-        return (catalogue.kept(self._job.out, self._note(), self._key()) or b"").decode()
+        return (catalogue.kept_content(self._job.out, self._note_name(), self._log_key()) or b"").decode()
 
-    def _note(self) -> str:
+    def _note_name(self) -> str:
         """Name of the file that keeps what is known of a log from campaign to campaign."""
         return f"inputs/{hashlib.sha256(self._job.run_id.encode()).hexdigest()}.txt"
 
-    def _key(self) -> str:
+    def _log_key(self) -> str:
         """One key for address and version: the address itself may hold what is nobody's business."""
         return hashlib.sha256(f"{self._job.address}\n{self._version}".encode()).hexdigest()
 
     @contextlib.contextmanager
-    def here(self) -> Iterator[Path]:
+    def local_copy(self) -> Iterator[Path]:
         """The log on this machine; raises `ChangedError` if somebody has written to it meanwhile."""
-        with storage.local_copy(self._job.address, self._version) as path, _named_by_address(self._job, path):
+        with storage.local_copy(self._job.address, self._version) as path, _with_own_address(self._job, path):
             if self._stored_version() != self._version:
-                raise changed(redacted(self._job.address))
+                raise changed_error(redacted(self._job.address))
             self.state = _signature(path)
             try:
                 yield path
@@ -77,7 +77,7 @@ class RecordedLog:
             self.digest_at(path)
             raise
         self.digest_at(path, run.input_digest)
-        self.raw_files = manifest.listing(run.notes.raw_logs) if run.notes.raw_logs else ""
+        self.raw_files = manifest.file_list_text(run.notes.raw_logs) if run.notes.raw_logs else ""
         return run
 
     def digest_at(self, path: Path, known: str = "") -> str:
@@ -86,9 +86,9 @@ class RecordedLog:
             with _as_input_error(path):
                 listed = storage.file_digests(path, known)
             self.digest = storage.digest_of_files(listed)
-            self.files = manifest.listing(listed)
+            self.files = manifest.file_list_text(listed)
             if self._version is not None:
-                catalogue.keep(self._job.out, self._note(), self._key(), self.digest.encode())
+                catalogue.keep(self._job.out, self._note_name(), self._log_key(), self.digest.encode())
         return self.digest
 
     def _stored_version(self) -> str | None:
@@ -98,7 +98,7 @@ class RecordedLog:
     def _check_unchanged(self, path: Path) -> None:
         """Refuse a log that changed since it was first looked at."""
         if _signature(path) != self.state:
-            raise changed(path)
+            raise changed_error(path)
 
 
 def _signature(path: Path) -> tuple[storage.FileState, ...]:
@@ -117,7 +117,7 @@ def _as_input_error(path: Path) -> Iterator[None]:
 
 
 @contextlib.contextmanager
-def _named_by_address(job: RunJob, path: Path) -> Iterator[None]:
+def _with_own_address(job: RunJob, path: Path) -> Iterator[None]:
     """Errors name the log by its own address, not by that of a temporary copy."""
     try:
         yield

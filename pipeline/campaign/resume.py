@@ -17,7 +17,7 @@ from pathlib import Path
 from pydantic import TypeAdapter
 
 from pipeline import storage
-from pipeline.campaign.plan import Plan, RunJob, digests
+from pipeline.campaign.plan import Plan, RunJob, run_digests
 from pipeline.campaign.waits import WAITS
 from pipeline.results import catalogue, packs, store
 from pipeline.results.outcome import RunOutcome
@@ -36,50 +36,50 @@ def proof_of(job: RunJob, log: tuple[storage.FileState, ...]) -> str:
         return ""
     if max(file.changed_ns for file in log) > time.time_ns() - WAITS.settled_s * NS_PER_S:
         return ""
-    place = _places(job.out, [job.run_id]).get(job.run_id)
-    return "" if place is None else f"{_made_of(job, log)} {place}"
+    place = _marker_states(job.out, [job.run_id]).get(job.run_id)
+    return "" if place is None else f"{_outcome_key(job, log)} {place}"
 
 
-def unchanged(plan: Plan) -> list[RunOutcome]:
+def unchanged_outcomes(plan: Plan) -> list[RunOutcome]:
     """The outcomes of the runs of a plan that are complete, and whose log nobody has touched since."""
-    known = in_place(plan.out)
+    known = outcomes_in_place(plan.out)
     candidates = ((job, known[job.run_id]) for job in plan.jobs if job.run_id in known)
-    return [replace(outcome, skipped=True) for job, outcome in candidates if _holds(job, outcome)]
+    return [replace(outcome, skipped=True) for job, outcome in candidates if _is_still_valid(job, outcome)]
 
 
-def in_place(out: str) -> dict[str, RunOutcome]:
+def outcomes_in_place(out: str) -> dict[str, RunOutcome]:
     """The outcomes that are kept of runs whose marker nobody has touched since."""
-    known = kept(out)
-    places = _places(out, list(known))
+    known = kept_outcomes(out)
+    places = _marker_states(out, list(known))
     return {run: outcome for run, outcome in known.items() if outcome.proof.partition(" ")[2] == places.get(run)}
 
 
 def keep_in_place(out: str, known: Mapping[str, RunOutcome]) -> None:
     """Keep these outcomes of runs that lie elsewhere now, with the same content."""
-    places = _places(out, list(known))
+    places = _marker_states(out, list(known))
     proofs = {run: outcome.proof.partition(" ")[0] for run, outcome in known.items()}
-    _keep(out, [replace(outcome, proof=f"{proofs[run]} {places[run]}") for run, outcome in known.items()])
+    _write_outcomes(out, [replace(outcome, proof=f"{proofs[run]} {places[run]}") for run, outcome in known.items()])
 
 
-def keep(plan: Plan, outcomes: Iterable[RunOutcome]) -> None:
+def keep_outcomes(plan: Plan, outcomes: Iterable[RunOutcome]) -> None:
     """Keep what can be proved, with what is known of runs that this call did not name."""
     if is_url(plan.out):
         return
     named = {job.run_id for job in plan.jobs}
-    others = [outcome for run_id, outcome in kept(plan.out).items() if run_id not in named]
-    _keep(plan.out, [replace(outcome, attempts=1) for outcome in (*others, *outcomes) if outcome.proof])
+    others = [outcome for run_id, outcome in kept_outcomes(plan.out).items() if run_id not in named]
+    _write_outcomes(plan.out, [replace(outcome, attempts=1) for outcome in (*others, *outcomes) if outcome.proof])
 
 
-def _keep(out: str, outcomes: list[RunOutcome]) -> None:
+def _write_outcomes(out: str, outcomes: list[RunOutcome]) -> None:
     """Keep the outcomes of a campaign that ends early."""
     # It can be done without, and so must not hide why a campaign ends.
     with contextlib.suppress(OutputError):
         catalogue.keep(out, _NAME, software_digest(), _OUTCOMES.dump_json(outcomes))
 
 
-def kept(out: str) -> dict[str, RunOutcome]:
+def kept_outcomes(out: str) -> dict[str, RunOutcome]:
     """The outcomes that this build of the program kept, by run id."""
-    content = None if is_url(out) else catalogue.kept(out, _NAME, software_digest())
+    content = None if is_url(out) else catalogue.kept_content(out, _NAME, software_digest())
     try:
         outcomes = _OUTCOMES.validate_json(content or b"[]")
     except ValueError:
@@ -87,24 +87,24 @@ def kept(out: str) -> dict[str, RunOutcome]:
     return {outcome.run_id: replace(outcome, seconds=0.0) for outcome in outcomes}
 
 
-def _holds(job: RunJob, outcome: RunOutcome) -> bool:
+def _is_still_valid(job: RunJob, outcome: RunOutcome) -> bool:
     """Whether an outcome kept is still that of the same log, settings and program."""
     if is_url(job.address) or (job.write_route and not Path(job.write_route).exists()):
         return False
     try:
-        return _made_of(job, storage.signature(Path(job.address))) == outcome.proof.partition(" ")[0]
+        return _outcome_key(job, storage.signature(Path(job.address))) == outcome.proof.partition(" ")[0]
     except OSError:
         return False
 
 
-def _made_of(job: RunJob, log: tuple[storage.FileState, ...]) -> str:
+def _outcome_key(job: RunJob, log: tuple[storage.FileState, ...]) -> str:
     """Digest of all that an outcome depends on."""
-    return hashlib.sha256(repr((job.address, log, digests(job, ""))).encode()).hexdigest()
+    return hashlib.sha256(repr((job.address, log, run_digests(job, ""))).encode()).hexdigest()
 
 
-def _places(out: str, runs: Sequence[str]) -> dict[str, str]:
+def _marker_states(out: str, runs: Sequence[str]) -> dict[str, str]:
     """What changes with the marker of each of these runs that is there: with its `runs` file, or its pack's index."""
-    packed = store.packed(out, runs)
+    packed = store.packed_runs_among(out, runs)
     files = {run: store.table_address(out, "runs", run) for run in runs}
     files |= {run: join(out, packs.file_name(packs.INDEX, place.pack.name)) for run, place in packed.items()}
     states = {file: storage.version(file) for file in set(files.values())}

@@ -18,11 +18,11 @@ import polars as pl
 from pipeline import storage
 from pipeline.campaign.cluster import DaskEngine
 from pipeline.campaign.engines import HAS_ALARM, Engine, LocalEngine, SerialEngine
-from pipeline.campaign.interruption import ENDING, Interrupted, listening
-from pipeline.campaign.lock import locked
-from pipeline.campaign.outcome import Result, RunFailure, failure_of, lost, never_begun, overdue
+from pipeline.campaign.interruption import ENDING, Interrupted, listen_for_signals
+from pipeline.campaign.lock import hold_output
+from pipeline.campaign.outcome import Result, RunFailure, failure_of, lost_text, never_begun_text, overdue_text
 from pipeline.campaign.plan import Plan, RunJob, with_previous
-from pipeline.campaign.resume import keep, unchanged
+from pipeline.campaign.resume import keep_outcomes, unchanged_outcomes
 from pipeline.campaign.waits import WAITS
 from pipeline.campaign.watch import Follower
 from pipeline.campaign.worker import fail_run
@@ -52,6 +52,8 @@ class _Attempt:
 
 @dataclass
 class _RunUnderWay:
+    """A run that an engine has, and since when."""
+
     attempt: _Attempt
     since_s: float
     handed_s: float
@@ -85,26 +87,26 @@ class CampaignLoop:
         self._said = False
         self._disturbed = False
 
-    def stop(self, signum: int) -> None:
+    def stop_at_next_look(self, signum: int) -> None:
         """End at the next look, because of this signal."""
         self._stop = signum
 
     @property
-    def disturbed(self) -> bool:
+    def is_disturbed(self) -> bool:
         """Whether a worker may have left something half written: lost, ended, or under way still."""
         return self._disturbed or bool(self._under_way)
 
-    def run(self) -> None:
+    def run_to_end(self) -> None:
         """Go on until every run has its outcome. Raises `Interrupted` when asked to stop."""
         for outcome in self._known:
-            self._note(outcome)
+            self._note_outcome(outcome)
         while self._waiting or self._under_way:
             self._hand_out()
             done, _ = wait(self._under_way, timeout=WAITS.look_s, return_when=FIRST_COMPLETED)
             if self._stop is not None:
                 raise Interrupted(self._stop)
             for result in done:
-                self._note(self._collect(result))
+                self._note_outcome(self._collect_outcome(result))
             self._end_overdue()
             self._look_for_workers()
             now = time.monotonic()
@@ -120,14 +122,14 @@ class CampaignLoop:
             now = time.monotonic()
             self._under_way[self._engine.submit(attempt.job)] = _RunUnderWay(attempt, now, now)
 
-    def _note(self, outcome: RunOutcome | None) -> None:
+    def _note_outcome(self, outcome: RunOutcome | None) -> None:
         """Keep the outcome of a run, and tell all watches."""
         if outcome is not None:
             self.outcomes.append(outcome)
             for watch in self._watches:
                 watch.finished(outcome)
 
-    def _collect(self, result: Result) -> RunOutcome | None:
+    def _collect_outcome(self, result: Result) -> RunOutcome | None:
         """The outcome, or none where the run is tried again."""
         item = self._under_way.pop(result)
         attempt = item.attempt
@@ -136,7 +138,7 @@ class CampaignLoop:
             if error is None:
                 return replace(result.result(), attempts=attempt.number)
             if item.overdue:
-                return _failed(attempt, RunFailure(overdue(self._limit_s), lasting=False))
+                return _failed_outcome(attempt, RunFailure(overdue_text(self._limit_s), lasting=False))
             if item.never_started:
                 return self._after_loss(attempt, begun=False)
             if isinstance(error, CancelledError):
@@ -148,9 +150,9 @@ class CampaignLoop:
             if isinstance(error, (BaliseError, *ENDING)):
                 raise error
             # The worker could not even tell what became of the run.
-            return _failed(attempt, failure_of(error, lasting=False))
+            return _failed_outcome(attempt, failure_of(error, lasting=False))
         finally:
-            self._engine.collected(result)
+            self._engine.forget_result(result)
 
     def _after_loss(self, attempt: _Attempt, begun: bool) -> RunOutcome | None:
         """A run that was under way when its worker died has one more attempt; one that waited has lost nothing."""
@@ -163,8 +165,8 @@ class CampaignLoop:
                 watch.lost(attempt.job.run_id, attempt.number)
             self._waiting.appendleft(_Attempt(attempt.job, attempt.number + 1))
             return None
-        return _failed(
-            attempt, RunFailure(lost(attempt.number) if begun else never_begun(attempt.starts), lasting=False)
+        return _failed_outcome(
+            attempt, RunFailure(lost_text(attempt.number) if begun else never_begun_text(attempt.starts), lasting=False)
         )
 
     def _end_overdue(self) -> None:
@@ -185,7 +187,7 @@ class CampaignLoop:
 
     def _look_for_workers(self) -> None:
         """Say soon that no worker is left, with what is done and what to do; raises `UsageError` in the end."""
-        lonely_s = self._engine.lonely_s()
+        lonely_s = self._engine.time_without_worker_s()
         done = f"{len(self.outcomes)} of {self._planned} runs are done"
         if lonely_s > WAITS.lonely_s:
             raise UsageError(
@@ -201,7 +203,7 @@ class CampaignLoop:
         self._said = lonely_s > WAITS.lonely_said_s
 
 
-def _failed(attempt: _Attempt, failure: RunFailure) -> RunOutcome:
+def _failed_outcome(attempt: _Attempt, failure: RunFailure) -> RunOutcome:
     """The outcome of a run that failed."""
     return replace(fail_run(attempt.job, failure), attempts=attempt.number)
 
@@ -239,9 +241,9 @@ def run_campaign(
         Interrupted: on SIGINT, SIGTERM and SIGHUP.
     """
     _check_shared(plan, scheduler)
-    with locked(plan.out) as campaign:
+    with hold_output(plan.out) as campaign:
         store.sweep(plan.out)
-        known = [] if force else unchanged(plan)
+        known = [] if force else unchanged_outcomes(plan)
         left = with_previous(plan, {outcome.run_id for outcome in known}) if not force else plan
         store.write_config(plan.out, plan.config)
         store.write_vehicle(plan.out, plan.vehicle)
@@ -251,15 +253,15 @@ def run_campaign(
         held = [replace(job, campaign=campaign) for job in left.jobs]
         loop = CampaignLoop(held, engine, time_limit_s, watches, known)
         try:
-            summary = _watched(plan, loop, watches, at_once=engine.in_process)
+            summary = _run_watched(plan, loop, watches, at_once=engine.in_process)
         finally:
             engine.close()
             # Of a cluster's workers one that is still at its run writes it again.
-            if loop.disturbed and not is_url(plan.out):
+            if loop.is_disturbed and not is_url(plan.out):
                 store.sweep(plan.out)
             if left.jobs:
-                keep(plan, loop.outcomes)
-        _finish(plan, loop, summary)
+                keep_outcomes(plan, loop.outcomes)
+        _write_tables(plan, loop, summary)
         return summary
 
 
@@ -278,15 +280,18 @@ def _check_shared(plan: Plan, scheduler: str | None) -> None:
         raise UsageError("workers cannot write into this process's memory", place=plan.out)
 
 
-def _watched(plan: Plan, loop: CampaignLoop, watches: Sequence[Follower], at_once: bool) -> CampaignSummary:
-    """`at_once`: the work is in this process, so that the loop's next look may be a whole run away."""
+def _run_watched(plan: Plan, loop: CampaignLoop, watches: Sequence[Follower], at_once: bool) -> CampaignSummary:
+    """Take the jobs of a plan through the loop, watched; all that became of them.
+
+    `at_once`: the work is in this process, so that the loop's next look may be a whole run away.
+    """
     begun = time.monotonic()
     for watch in watches:
         watch.begin(len(plan.jobs), plan.out)
     stopped: Interrupted | None = None
-    with listening(loop.stop, at_once):
+    with listen_for_signals(loop.stop_at_next_look, at_once):
         try:
-            loop.run()
+            loop.run_to_end()
         except Interrupted as interrupted:
             stopped = interrupted
         finally:
@@ -299,12 +304,12 @@ def _watched(plan: Plan, loop: CampaignLoop, watches: Sequence[Follower], at_onc
     return summary
 
 
-def _finish(plan: Plan, loop: CampaignLoop, summary: CampaignSummary) -> None:
+def _write_tables(plan: Plan, loop: CampaignLoop, summary: CampaignSummary) -> None:
     """The tables over all runs; they too are given up when somebody asks to stop."""
     from pipeline.campaign.run import write_campaign  # statistics, which take long to load
 
     made = [outcome.run_id for outcome in summary.outcomes if not outcome.skipped]
-    with listening(loop.stop, at_once=True):
+    with listen_for_signals(loop.stop_at_next_look, at_once=True):
         try:
             write_campaign(plan.out, plan.config, made)
         except Interrupted as interrupted:
@@ -336,7 +341,7 @@ def _is_current(out: Address, key: str) -> bool:
     """Whether all of these tables are there, made from these runs, and as the manifest has them."""
     names = [f"campaign/{name.removeprefix('campaign_')}.parquet" for name in CAMPAIGN_TABLES]
     contents = {name: storage.content_of(join(out, name)) for name in names}
-    expected = manifest.earlier(out)["files"]
+    expected = manifest.earlier_manifest(out)["files"]
     return all(
         content is not None
         and metadata_of(content).get(_MADE_FROM) == key

@@ -16,14 +16,14 @@ from pipeline.campaign.outcome import (
     failed_tables,
     failure_of,
     outcome_of,
-    worst,
+    worst_status,
 )
-from pipeline.campaign.plan import RunJob, digests, site_at
+from pipeline.campaign.plan import RunJob, run_digests, site_at
 from pipeline.campaign.recorded_log import RecordedLog
 from pipeline.campaign.resume import proof_of
 from pipeline.read.site.route import with_route
 from pipeline.results import store
-from pipeline.results.manifest import tables_noted
+from pipeline.results.manifest import digests_in_marker
 from pipeline.results.marker import sha256
 from pipeline.results.outcome import RunOutcome
 from pipeline.results.software import software_digest
@@ -56,20 +56,20 @@ def replay_one(job: RunJob) -> RunOutcome:
 
 def _replay_one(job: RunJob, log: RecordedLog) -> RunOutcome:
     """Replay a run, unless its results are there already."""
-    _same_software(job)
+    _require_same_software(job)
     site = site_at(job.site, job.site_digest, job.config.site)
     if (known := log.known_digest()) and _is_done(job, known):
-        return _earlier(job, log)
-    with log.here() as path:
+        return _earlier_outcome(job, log)
+    with log.local_copy() as path:
         if job.previous is not None and _is_done(job, log.digest_at(path)):
-            return _earlier(job, log)
+            return _earlier_outcome(job, log)
         run = log.read(path)
         site = with_route(site, job.route, job.config.site) if job.route else site
-        tables = _replayed(job, run, site)
+        tables = _replay(job, run, site)
         if job.write_route:
             _write_travelled_route(job, run, site)
-    _write(job, tables, _metadata(job, log, worst(tables.runs)) | {"log_digest": run.input_digest})
-    return _proved(job, log, _outcome(job, tables.runs, tables.hazards, tables.passages))
+    _write_if_held(job, tables, _run_metadata(job, log, worst_status(tables.runs)) | {"log_digest": run.input_digest})
+    return _with_proof(job, log, _outcome_of_tables(job, tables.runs, tables.hazards, tables.passages))
 
 
 def fail_run(job: RunJob, failure: RunFailure, log: RecordedLog | None = None) -> RunOutcome:
@@ -77,18 +77,18 @@ def fail_run(job: RunJob, failure: RunFailure, log: RecordedLog | None = None) -
 
     Unless the reason is lasting (a worker was lost, a run took too long) the next campaign tries the run again.
     """
-    metadata = _metadata(job, log, RunStatus.FAILED) | ({} if failure.lasting else {"redo": "yes"})
-    _write(job, failed_tables(job, failure.error), metadata)
+    metadata = _run_metadata(job, log, RunStatus.FAILED) | ({} if failure.lasting else {"redo": "yes"})
+    _write_if_held(job, failed_tables(job, failure.error), metadata)
     outcome = RunOutcome(job.run_id, RunStatus.FAILED, failure.error, trace=failure.trace)
-    return _proved(job, log, outcome) if failure.lasting and log is not None else outcome
+    return _with_proof(job, log, outcome) if failure.lasting and log is not None else outcome
 
 
-def _proved(job: RunJob, log: RecordedLog, outcome: RunOutcome) -> RunOutcome:
+def _with_proof(job: RunJob, log: RecordedLog, outcome: RunOutcome) -> RunOutcome:
     """An outcome with what proves of which log it is."""
     return replace(outcome, proof=proof_of(job, log.state))
 
 
-def _write(job: RunJob, tables: RunTables, metadata: Mapping[str, str]) -> None:
+def _write_if_held(job: RunJob, tables: RunTables, metadata: Mapping[str, str]) -> None:
     """Write the run, if its campaign is the one that holds the output still."""
     try:
         _write_held(job, tables, metadata)
@@ -104,7 +104,7 @@ def _write_held(job: RunJob, tables: RunTables, metadata: Mapping[str, str]) -> 
     store.write_run(tables, job.out, metadata)
 
 
-def _same_software(job: RunJob) -> None:
+def _require_same_software(job: RunJob) -> None:
     """Refuse to replay with another version of the program than the campaign's."""
     if software_digest() != job.software_digest:
         raise UsageError(
@@ -120,28 +120,29 @@ def _is_done(job: RunJob, files_digest: str) -> bool:
         return False
     if job.write_route and not files.exists(job.write_route):
         return False
-    made = digests(job, files_digest)
+    made = run_digests(job, files_digest)
     return all(job.previous.get(key) == value for key, value in made.items()) and _is_whole(job, job.previous)
 
 
 def _is_whole(job: RunJob, marker: Mapping[str, str]) -> bool:
     """The tables that the outcome is read from are those that the marker was written with."""
-    expected = tables_noted(marker)
+    expected = digests_in_marker(marker)
     return all(sha256(store.content_of(job.out, name, job.run_id)) == expected.get(name) for name in _OUTCOME)
 
 
-def _earlier(job: RunJob, log: RecordedLog) -> RunOutcome:
+def _earlier_outcome(job: RunJob, log: RecordedLog) -> RunOutcome:
     """The outcome of a run that is complete already."""
     runs, hazards, passages = (store.tables_of(job.out, name, [job.run_id]) for name in ("runs", *_OUTCOME))
-    return _proved(job, log, replace(_outcome(job, runs, hazards, passages), skipped=True))
+    return _with_proof(job, log, replace(_outcome_of_tables(job, runs, hazards, passages), skipped=True))
 
 
-def _outcome(job: RunJob, *tables: pl.DataFrame) -> RunOutcome:
+def _outcome_of_tables(job: RunJob, *tables: pl.DataFrame) -> RunOutcome:
     """The outcome of a run, of its tables."""
     return outcome_of(job.run_id, job.address, job.config.advice.low_availability, *tables)
 
 
-def _replayed(job: RunJob, run: RunLog, site: Site) -> RunTables:
+def _replay(job: RunJob, run: RunLog, site: Site) -> RunTables:
+    """Replay a run."""
     # Imported here because it takes most of a second, and the parent of a campaign never needs it.
     from pipeline.one_run import replay
 
@@ -160,8 +161,14 @@ def _write_travelled_route(job: RunJob, run: RunLog, site: Site) -> None:
     storage.write_bytes(job.write_route, route.write_csv().encode())
 
 
-def _metadata(job: RunJob, log: RecordedLog | None, status: RunStatus) -> dict[str, str]:
+def _run_metadata(job: RunJob, log: RecordedLog | None, status: RunStatus) -> dict[str, str]:
     """What the results of a run say about their origin."""
     digest, listed = ("", "") if log is None else (log.digest, log.files)
     raw = {"raw_files": log.raw_files} if log is not None and log.raw_files else {}
-    return {**digests(job, digest), "log_files": listed, **raw, "site_files": job.site_files, "status": status.value}
+    return {
+        **run_digests(job, digest),
+        "log_files": listed,
+        **raw,
+        "site_files": job.site_files,
+        "status": status.value,
+    }

@@ -286,10 +286,10 @@ def _with_calibration(steps: _Steps, plan: Plan) -> Plan:
     asked = steps.opened.project.replay.calibrate
     if not asked:
         return plan
-    from pipeline.campaign.calibrated import AUTO, calibrated
+    from pipeline.campaign.calibrated import AUTO, calibrate_plan
 
     steps.call.said("calibrate", "each run from others")
-    return calibrated(plan, [one if one == AUTO else steps.opened.place(one) for one in asked], steps.call.jobs)
+    return calibrate_plan(plan, [one if one == AUTO else steps.opened.place(one) for one in asked], steps.call.jobs)
 
 
 def _refuse_other_results(plan: Plan, call: CallOptions) -> None:

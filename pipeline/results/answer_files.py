@@ -55,7 +55,7 @@ def write_csv(answer: pl.DataFrame, file: Path, guard: bool = True) -> None:
     `guard`: texts that a spreadsheet would run get an apostrophe in front
     (https://owasp.org/www-community/attacks/CSV_Injection).
     """
-    flat = _flat(answer)
+    flat = _without_lists(answer)
     if guard:
         text_columns = pl.col(pl.String)
         runs = text_columns.str.contains(r"^[=+\-@\t\r]")
@@ -80,7 +80,7 @@ def write_xlsx(answer: pl.DataFrame, file: Path) -> None:
             "is too long for Excel", place=str(file), found=f"{answer.height} rows", expected=f"at most {_MOST_ROWS}"
         )
     times = [name for name, dtype in answer.schema.items() if isinstance(dtype, pl.Datetime)]
-    plain = _flat(answer).with_columns(pl.col(times).dt.replace_time_zone(None).dt.cast_time_unit("ms"))
+    plain = _without_lists(answer).with_columns(pl.col(times).dt.replace_time_zone(None).dt.cast_time_unit("ms"))
     buffer = io.BytesIO()
     try:
         plain.write_excel(buffer, dtype_formats={pl.Datetime: _TIMES}, freeze_panes=(1, 0), autofit=True)
@@ -90,7 +90,7 @@ def write_xlsx(answer: pl.DataFrame, file: Path) -> None:
     write_bytes(file, buffer.getvalue())
 
 
-def _flat(answer: pl.DataFrame) -> pl.DataFrame:
+def _without_lists(answer: pl.DataFrame) -> pl.DataFrame:
     """The answer without lists, which neither format can hold."""
     lists = [name for name, dtype in answer.schema.items() if isinstance(dtype, pl.List)]
     return answer.with_columns(pl.col(name).cast(pl.List(pl.String)).list.join(" ") for name in lists)

@@ -21,7 +21,7 @@ def keep(out: Address, name: str, key: str, content: bytes) -> None:
     storage.write_bytes(_address(out, name), hashlib.sha256(entry).hexdigest().encode() + b"\n" + entry)
 
 
-def kept(out: Address, name: str, key: str) -> bytes | None:
+def kept_content(out: Address, name: str, key: str) -> bytes | None:
     """The content kept under this name and key; None where it is missing, damaged or made from something else."""
     try:
         digest, _, entry = (storage.content_of(_address(out, name)) or b"").partition(b"\n")

@@ -41,16 +41,22 @@ SettingsFiles = Mapping[str, Any]
 
 
 class _Strict(BaseModel):
+    """Models of the file: unknown keys are refused."""
+
     model_config = ConfigDict(extra="forbid", strict=True)
 
 
 class _File(_Strict):
+    """A file with its size and digest."""
+
     name: str = ""
     bytes: int
     sha256: str
 
 
 class _Run(_Strict):
+    """What one run was made from."""
+
     status: str | None
     software: str | None
     software_digest: str | None
@@ -63,6 +69,8 @@ class _Run(_Strict):
 
 
 class _Form(_Strict):
+    """The manifest as it is written."""
+
     manifest: Literal[1]
     program: dict[str, Any]
     platform: dict[str, str]
@@ -76,17 +84,17 @@ class _Form(_Strict):
 def settings_files(configuration: Path | None = None, vehicle: Path | None = None) -> SettingsFiles:
     """Names, sizes and digests of the settings files that were given."""
     paths = {"configuration": configuration, "vehicle": vehicle}
-    return {name: None if path is None else _file(storage.file_digests(path)[0]) for name, path in paths.items()}
+    return {name: None if path is None else _file_entry(storage.file_digests(path)[0]) for name, path in paths.items()}
 
 
-def listing(listed: Iterable[tuple[str, int, str]]) -> str:
+def file_list_text(listed: Iterable[tuple[str, int, str]]) -> str:
     """Files with name, size [bytes] and SHA-256 as they stand in the metadata of a run."""
     return json.dumps([list(file) for file in listed])
 
 
 def note_settings(out: Address, config_digest: str, settings: SettingsFiles) -> None:
     """Keep the names of this call's settings files, before any run is made with them."""
-    manifest = earlier(out)
+    manifest = earlier_manifest(out)
     known = manifest["settings"].setdefault(config_digest, [])
     if settings not in known:
         known.append(settings)
@@ -95,9 +103,9 @@ def note_settings(out: Address, config_digest: str, settings: SettingsFiles) -> 
 
 def note_pages(out: Address, pages: Mapping[str, bytes]) -> None:
     """Keep the digests of the pages of this result, by their names in `OUT/report`, where it has a manifest."""
-    manifest = earlier(out)
+    manifest = earlier_manifest(out)
     if manifest["runs"]:
-        _write(out, manifest | {"pages": {name: _digested(content) for name, content in sorted(pages.items())}})
+        _write(out, manifest | {"pages": {name: _content_entry(content) for name, content in sorted(pages.items())}})
 
 
 def write_manifest(out: Address, made: Collection[str] = ()) -> None:
@@ -105,8 +113,8 @@ def write_manifest(out: Address, made: Collection[str] = ()) -> None:
 
     A run that was changed since without being replayed keeps its entry, so that `balise verify` goes on to see it.
     """
-    before = earlier(out)
-    manifest = gathered(out, before)
+    before = earlier_manifest(out)
+    manifest = gather_manifest(out, before)
     for run, found in manifest["runs"].items():
         named = before["runs"].get(run)
         if run not in made and _is_altered(named, found):
@@ -114,22 +122,22 @@ def write_manifest(out: Address, made: Collection[str] = ()) -> None:
     _write(out, manifest)
 
 
-def unaltered(out: Address, runs: Sequence[str]) -> dict[str, dict[str, str]]:
+def unaltered_metadata(out: Address, runs: Sequence[str]) -> dict[str, dict[str, str]]:
     """Metadata of each complete run among these whose marker is as it was written."""
     if not runs:
         return {}
-    named = earlier(out)["runs"]
+    named = earlier_manifest(out)["runs"]
     found = ((marker, marker.metadata) for marker in store.markers(out, runs))
     return {
         marker.run_id: metadata
         for marker, metadata in found
-        if not _is_altered(named.get(marker.run_id), _run(metadata, marker.sha256))
+        if not _is_altered(named.get(marker.run_id), _run_entry(metadata, marker.sha256))
     }
 
 
-def tables_noted(metadata: Mapping[str, str]) -> dict[str, str]:
+def digests_in_marker(metadata: Mapping[str, str]) -> dict[str, str]:
     """The digests of the other tables that stand in a marker."""
-    return _parsed(_DIGESTS, metadata.get("tables"), {})
+    return _parse_metadata(_DIGESTS, metadata.get("tables"), {})
 
 
 def _is_altered(named: Mapping[str, Any] | None, found: Mapping[str, Any]) -> bool:
@@ -139,19 +147,19 @@ def _is_altered(named: Mapping[str, Any] | None, found: Mapping[str, Any]) -> bo
     return named["tables"] != found["tables"] and {**named, "tables": None} == {**found, "tables": None}
 
 
-def gathered(out: Address, before: Manifest) -> Manifest:
+def gather_manifest(out: Address, before: Manifest) -> Manifest:
     """The manifest as the files of the result say; of the one before what no file says."""
     runs: dict[str, Any] = {}
     sites: dict[str, Any] = {}
     for marker in store.markers(out):
         metadata = marker.metadata
         site = metadata.get("site_digest", "").partition(" ")[0]
-        sites[site] = _files(metadata.get("site_files"))
-        runs[marker.run_id] = _run(metadata, marker.sha256)
+        sites[site] = _file_entries(metadata.get("site_files"))
+        runs[marker.run_id] = _run_entry(metadata, marker.sha256)
     used = {run["config_digest"] for run in runs.values()}
     pages = {"pages": before["pages"]} if before.get("pages") else {}
     return {
-        **_frame(),
+        **_manifest_frame(),
         "settings": {digest: files for digest, files in sorted(before["settings"].items()) if digest in used},
         "files": _own_files(out),
         "sites": dict(sorted(sites.items())),
@@ -197,12 +205,12 @@ def anchor_words(digest: str, runs: int) -> str:
     return f"{NAME}: sha256 {digest} of {runs} {'run' if runs == 1 else 'runs'}"
 
 
-def earlier(out: Address) -> Manifest:
+def earlier_manifest(out: Address) -> Manifest:
     """The manifest as earlier calls left it; one that cannot be read is written anew."""
     try:
-        return read_manifest(out) or _frame()
+        return read_manifest(out) or _manifest_frame()
     except UsageError:
-        return _frame()
+        return _manifest_frame()
 
 
 def own_file_names(out: Address) -> list[str]:
@@ -214,11 +222,11 @@ def own_file_names(out: Address) -> list[str]:
     return [*settings, *packed, *(f"campaign/{name}" for name in there if re.fullmatch(r"\w+\.parquet", name))]
 
 
-def _frame() -> Manifest:
+def _manifest_frame() -> Manifest:
     """What does not come from runs."""
     return {
         "manifest": FORMAT,
-        "program": {"software": SOFTWARE, "contract": CONTRACT_VERSION, "packages": dict(_packages())},
+        "program": {"software": SOFTWARE, "contract": CONTRACT_VERSION, "packages": dict(_package_versions())},
         "platform": {
             "python": platform.python_version(),
             "system": platform.system(),
@@ -232,7 +240,7 @@ def _frame() -> Manifest:
 
 
 @cache
-def _packages() -> Mapping[str, str]:
+def _package_versions() -> Mapping[str, str]:
     """Versions of the packages that the program needs."""
     try:
         needed = [re.split(r"[^\w.-]", line)[0] for line in requires("balise") or [] if "extra ==" not in line]
@@ -241,29 +249,29 @@ def _packages() -> Mapping[str, str]:
     return MappingProxyType({name: version(name) for name in sorted(needed, key=str.lower)})
 
 
-def _run(metadata: Mapping[str, str], runs_sha256: str) -> dict[str, Any]:
+def _run_entry(metadata: Mapping[str, str], runs_sha256: str) -> dict[str, Any]:
     """What one run was made from, and the digests of its tables."""
-    digests = tables_noted(metadata) | {"runs": runs_sha256}
+    digests = digests_in_marker(metadata) | {"runs": runs_sha256}
     site, _, route = metadata.get("site_digest", "").partition(" ")
     return {
         "status": metadata.get("status"),
         "software": metadata.get("software"),
         "software_digest": metadata.get("software_digest"),
         "config_digest": metadata.get("config_digest"),
-        "log": _files(metadata.get("log_files")),
-        **({"raw": raw} if (raw := _files(metadata.get("raw_files"))) else {}),
+        "log": _file_entries(metadata.get("log_files")),
+        **({"raw": raw} if (raw := _file_entries(metadata.get("raw_files"))) else {}),
         "site": site,
         "route_sha256": route or None,
         "tables": {name: digests.get(name) for name in TABLES},
     }
 
 
-def _files(listed: str | None) -> list[dict[str, Any]]:
-    """Files of a list in the form of the manifest."""
-    return [_file(FileDigest(*file)) for file in _parsed(_LISTING, listed, [])]
+def _file_entries(listed: str | None) -> list[dict[str, Any]]:
+    """Files that a run's metadata lists, in the form of the manifest."""
+    return [_file_entry(FileDigest(*file)) for file in _parse_metadata(_LISTING, listed, [])]
 
 
-def _parsed(kind: TypeAdapter[T], text: str | None, default: T) -> T:
+def _parse_metadata(kind: TypeAdapter[T], text: str | None, default: T) -> T:
     """What stands in the metadata of a run; the default for text that this program did not write."""
     try:
         return default if text is None else kind.validate_json(text)
@@ -271,7 +279,7 @@ def _parsed(kind: TypeAdapter[T], text: str | None, default: T) -> T:
         return default
 
 
-def _file(file: FileDigest) -> dict[str, Any]:
+def _file_entry(file: FileDigest) -> dict[str, Any]:
     """A file in the form of the manifest."""
     return {"name": file.name, "bytes": file.size_bytes, "sha256": file.sha256}
 
@@ -279,10 +287,10 @@ def _file(file: FileDigest) -> dict[str, Any]:
 def _own_files(out: Address) -> dict[str, dict[str, Any]]:
     """Size and digest of the files that the campaign itself wrote."""
     contents = {name: storage.content_of(join(out, name)) for name in own_file_names(out)}
-    return {name: _digested(content) for name, content in contents.items() if content is not None}
+    return {name: _content_entry(content) for name, content in contents.items() if content is not None}
 
 
-def _digested(content: bytes) -> dict[str, Any]:
+def _content_entry(content: bytes) -> dict[str, Any]:
     """Size and digest of a content."""
     return {"bytes": len(content), "sha256": sha256(content)}
 

@@ -64,13 +64,15 @@ class RunOutcome:
     lost: str = ""
 
     @property
-    def defect(self) -> bool:
-        """The run failed by a defect of the program."""
+    def is_defect(self) -> bool:
+        """Whether the run failed by a defect of the program."""
         return self.trace is not None
 
 
 @frozen
 class CampaignSummary:
+    """What became of all runs of a campaign."""
+
     planned: int
     outcomes: tuple[RunOutcome, ...]
     seconds: float
@@ -96,20 +98,20 @@ class CampaignSummary:
 
     @property
     def all_ok(self) -> bool:
-        """Every planned run is there, and is ok."""
+        """Whether every planned run is there, and is ok."""
         return self.count(RunStatus.OK) == self.planned
 
     @property
-    def skipped(self) -> int:
+    def count_skipped(self) -> int:
         """How many runs were there already."""
         return sum(outcome.skipped for outcome in self.outcomes)
 
     @property
-    def defects(self) -> int:
+    def count_defects(self) -> int:
         """How many runs failed by a defect of the program."""
-        return sum(outcome.defect for outcome in self.outcomes)
+        return sum(outcome.is_defect for outcome in self.outcomes)
 
     @property
-    def left(self) -> int:
+    def count_left(self) -> int:
         """How many planned runs were not reached."""
         return self.planned - len(self.outcomes)

@@ -43,25 +43,25 @@ def read_rows(
         file = _file_of(out, table, pack)
         spans = packs.index_of(out, pack).spans(table, rows.values())
         heights = {run_id: end - first for run_id, (first, end) in zip(rows, spans, strict=True)}
-        check(next(iter(rows)), _columns(file))
+        check(next(iter(rows)), _column_types(file))
         if columns:
-            yield heights, pl.DataFrame(pl.from_arrow(_read(file, spans, columns))).select(columns)
+            yield heights, pl.DataFrame(pl.from_arrow(_read_rows(file, spans, columns))).select(columns)
         else:
             yield heights, pl.DataFrame(height=sum(heights.values()))
 
 
-def of_run(out: Address, table: str, place: PackedRun) -> pa.Table:
+def table_of_run(out: Address, table: str, place: PackedRun) -> pa.Table:
     """The table of one run as `as_written` gives it."""
-    return next(as_written(out, table, place.pack, [place.row]))
+    return next(tables_as_written(out, table, place.pack, [place.row]))
 
 
-def as_written(out: Address, table: str, pack: Pack, rows: Sequence[int]) -> Iterator[pa.Table]:
+def tables_as_written(out: Address, table: str, pack: Pack, rows: Sequence[int]) -> Iterator[pa.Table]:
     """The table of each of these runs with the schema that its own file had, without metadata."""
     file = _file_of(out, table, pack)
     spans = packs.index_of(out, pack).spans(table, rows)
-    schema = written_schema(_footer(file)).remove_metadata()
+    schema = written_schema(_read_footer(file)).remove_metadata()
     begin = 0
-    whole = _read(file, spans, None).cast(schema).drop_columns("run_id")
+    whole = _read_rows(file, spans, None).cast(schema).drop_columns("run_id")
     for first, end in spans:
         yield whole.slice(begin, end - first)
         begin += end - first
@@ -72,27 +72,27 @@ def _file_of(out: Address, table: str, pack: Pack) -> _File:
     return _File(str(out), table, pack.name, pack.ends[table])
 
 
-def _read(file: _File, spans: Sequence[Span], columns: Sequence[str] | None) -> pa.Table:
+def _read_rows(file: _File, spans: Sequence[Span], columns: Sequence[str] | None) -> pa.Table:
     """Rows of a packed table."""
     try:
-        source = _opened(file, _footer(file))
+        source = _open_by_footer(file, _read_footer(file))
         numbers = source.groups(spans)
         if len(numbers) > 1:
             return source.rows(spans, source.read(numbers, columns), numbers)
         # Whoever asks for one run after the other finds the next ones in the same group.
-        kept = _group(file, numbers[0], None if columns is None else tuple(columns)) if numbers else None
+        kept = _read_group(file, numbers[0], None if columns is None else tuple(columns)) if numbers else None
         return source.read([], columns) if kept is None else source.rows(spans, kept, numbers)
     except (ParquetError, InputError) as error:
-        raise packs.unusable(file.out, packs.file_name(file.table, file.name), str(error)) from None
+        raise packs.unusable_error(file.out, packs.file_name(file.table, file.name), str(error)) from None
 
 
-def _opened(file: _File, footer: pq.FileMetaData) -> GroupedFile:
+def _open_by_footer(file: _File, footer: pq.FileMetaData) -> GroupedFile:
     """A packed table, opened by its footer."""
     return GroupedFile(files.in_parts(join(file.out, packs.file_name(file.table, file.name))), footer)
 
 
 @lru_cache(maxsize=32)
-def _footer(file: _File) -> pq.FileMetaData:
+def _read_footer(file: _File) -> pq.FileMetaData:
     """What the end of the file says. Refuses the file of another result under the name of this one."""
     try:
         end = parquet.end_of(files.in_parts(join(file.out, packs.file_name(file.table, file.name))))
@@ -100,16 +100,16 @@ def _footer(file: _File) -> pq.FileMetaData:
             raise ParquetError("it is not the one that was packed")
         return parquet.metadata_in(end)
     except (ParquetError, InputError) as error:
-        raise packs.unusable(file.out, packs.file_name(file.table, file.name), str(error)) from None
+        raise packs.unusable_error(file.out, packs.file_name(file.table, file.name), str(error)) from None
 
 
 @lru_cache(maxsize=32)
-def _columns(file: _File) -> ColumnTypes:
+def _column_types(file: _File) -> ColumnTypes:
     """Columns of a packed table, with their types."""
-    return _opened(file, _footer(file)).columns()
+    return _open_by_footer(file, _read_footer(file)).columns()
 
 
 @lru_cache(maxsize=16)
-def _group(file: _File, number: int, columns: tuple[str, ...] | None) -> pa.Table:
+def _read_group(file: _File, number: int, columns: tuple[str, ...] | None) -> pa.Table:
     """One row group of a packed table."""
-    return _opened(file, _footer(file)).read([number], columns)
+    return _open_by_footer(file, _read_footer(file)).read([number], columns)

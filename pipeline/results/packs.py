@@ -67,6 +67,8 @@ class Pack(BaseModel):
 
 
 class _List(BaseModel):
+    """The list of packs as it is written."""
+
     model_config = ConfigDict(extra="forbid", strict=True)
 
     compact: Literal[1]
@@ -92,19 +94,19 @@ class Index(NamedTuple):
         return [(int(starts[row]), int(starts[row + 1])) for row in rows]
 
 
-def listed(out: Address) -> list[Pack]:
+def read_list(out: Address) -> list[Pack]:
     """The packs of a result, in order; none where it has none. Raises `UsageError` for a list that cannot be read."""
     content = storage.content_of(join(out, LIST))
-    return [] if content is None else _parsed(str(out), content)
+    return [] if content is None else _parse_list(str(out), content)
 
 
 @lru_cache(maxsize=4)
-def _parsed(out: str, content: bytes) -> list[Pack]:
+def _parse_list(out: str, content: bytes) -> list[Pack]:
     """The packs of a list."""
     try:
         return _List.model_validate_json(content).packs
     except ValidationError as error:
-        raise unusable(out, LIST, str(error.errors()[0]["msg"])) from None
+        raise unusable_error(out, LIST, str(error.errors()[0]["msg"])) from None
 
 
 def write_list(out: Address, packs: Sequence[Pack]) -> None:
@@ -126,31 +128,31 @@ def file_digests(pack: Pack) -> dict[str, str]:
     return {file_name(part, pack.name): digest for part, digest in pack.sha256.items()}
 
 
-def _whole(out: Address, file: str, digest: str) -> bytes:
+def _verified_content(out: Address, file: str, digest: str) -> bytes:
     """Content of a file of a pack, which must be there and whole."""
     content = storage.content_of(join(out, file))
     if content is None or sha256(content) != digest:
-        raise unusable(out, file, "is missing" if content is None else "is damaged")
+        raise unusable_error(out, file, "is missing" if content is None else "is damaged")
     return content
 
 
-def find(out: Address, among: Iterable[str] | None = None) -> dict[str, PackedRun]:
+def find_packed(out: Address, among: Iterable[str] | None = None) -> dict[str, PackedRun]:
     """The packed ones of these runs; of all runs in the order of their ids."""
-    packs = listed(out)
+    packs = read_list(out)
     if not packs:
         return {}
-    places = _places(str(out), tuple((pack.name, pack.sha256[INDEX]) for pack in packs))
+    places = _places_in_packs(str(out), tuple((pack.name, pack.sha256[INDEX]) for pack in packs))
     runs = sorted(places) if among is None else [run_id for run_id in among if run_id in places]
     return {run_id: PackedRun(packs[places[run_id][0]], places[run_id][1]) for run_id in runs}
 
 
 @lru_cache(maxsize=4)
-def _places(out: str, packs: tuple[tuple[str, str], ...]) -> dict[str, tuple[int, int]]:
+def _places_in_packs(out: str, packs: tuple[tuple[str, str], ...]) -> dict[str, tuple[int, int]]:
     """Number of the last pack that has each run, and the row there."""
     return {
         run_id: (number, row)
         for number, (name, digest) in enumerate(packs)
-        for row, run_id in enumerate(_index(out, name, digest).run_ids)
+        for row, run_id in enumerate(_index_of_file(out, name, digest).run_ids)
     }
 
 
@@ -164,11 +166,11 @@ def by_pack(runs: Mapping[str, PackedRun]) -> Iterator[tuple[Pack, dict[str, int
 
 def index_of(out: Address, pack: Pack) -> Index:
     """Which runs a pack holds, and where. Raises `UsageError` where its index is not what was written."""
-    return _index(str(out), pack.name, pack.sha256[INDEX])
+    return _index_of_file(str(out), pack.name, pack.sha256[INDEX])
 
 
 @lru_cache(maxsize=256)
-def _index(out: str, name: str, digest: str) -> Index:
+def _index_of_file(out: str, name: str, digest: str) -> Index:
     """Rows of each run within the tables of a pack."""
     rows = _read_index(out, name, digest, tuple(column for column in INDEX_COLUMNS if column not in _OF_MARKER))
     starts = {table: np.concatenate([[0], rows[f"{table}_rows"].cum_sum().to_numpy()]) for table in TABLES}
@@ -177,7 +179,8 @@ def _index(out: str, name: str, digest: str) -> Index:
 
 @lru_cache(maxsize=2)
 def _read_index(out: str, name: str, digest: str, columns: tuple[str, ...]) -> pl.DataFrame:
-    return parquet.read_parquet(_whole(out, file_name(INDEX, name), digest), lambda _: columns)
+    """The columns of an index, which must be what was written."""
+    return parquet.read_parquet(_verified_content(out, file_name(INDEX, name), digest), lambda _: columns)
 
 
 def markers(out: Address, runs: Mapping[str, PackedRun]) -> Iterator[Marker]:
@@ -189,7 +192,7 @@ def markers(out: Address, runs: Mapping[str, PackedRun]) -> Iterator[Marker]:
 
 def sweep(out: Address) -> None:
     """Remove files of packs that do not count."""
-    names = {f"{pack.name}.parquet" for pack in listed(out)} | {LIST.rpartition("/")[2]}
+    names = {f"{pack.name}.parquet" for pack in read_list(out)} | {LIST.rpartition("/")[2]}
     for part in (INDEX, *TABLES):
         folder = join(out, FOLDER if part == INDEX else f"{part}/{FOLDER}")
         there = storage.files_below(folder)
@@ -204,7 +207,7 @@ class GoneError(UsageError):
     """A file of the result was listed and is not there: it is lost, or `compact` took its rows elsewhere meanwhile."""
 
 
-def steady(read: Callable[[], T]) -> T:
+def read_twice_if_moved(read: Callable[[], T]) -> T:
     """What is read of a result, once more where `compact` has moved rows between two looks.
 
     Raises `GoneError` where a file is gone the second time as well.
@@ -215,7 +218,7 @@ def steady(read: Callable[[], T]) -> T:
         return read()
 
 
-def unusable(out: Address, file: str, reason: str) -> UsageError:
+def unusable_error(out: Address, file: str, reason: str) -> UsageError:
     """The error for a pack that cannot be read, or is gone."""
     kind = UsageError if files.exists(join(out, file)) else GoneError
     return kind(

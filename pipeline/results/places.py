@@ -164,10 +164,10 @@ def element_lines_m(site: Site) -> Iterator[tuple[str, Floats, Floats]]:
     nothing = np.full(len(survey.latitude_deg), np.nan)
     east, north = plane_m(GroundPositions(survey.latitude_deg, survey.longitude_deg, nothing, nothing), origin_of(site))
     for _, name, rows in survey.elements():
-        yield name, _thinned(east[rows]), _thinned(north[rows])
+        yield name, _thin(east[rows]), _thin(north[rows])
 
 
-def _thinned(values: Floats) -> Floats:
+def _thin(values: Floats) -> Floats:
     """Some thousand of the values, the last one among them."""
     return np.append(values[: -1 : max(1, -(-len(values) // _POINTS))], values[-1:])
 

@@ -53,39 +53,41 @@ def run_sql(
     `others`: more results by name; `{"old": OUT}` adds the tables `old_runs`, `old_hazards` and so on.
     `allow_files`: the query may also read other files of this machine (`read_csv` and its like).
     """
-    return packs.steady(partial(_answered, out, sql, allow_files, others or {}))
+    return packs.read_twice_if_moved(partial(_answer, out, sql, allow_files, others or {}))
 
 
-def _answered(out: Address, sql: str, allow_files: bool, others: Mapping[str, Address]) -> pl.DataFrame:
+def _answer(out: Address, sql: str, allow_files: bool, others: Mapping[str, Address]) -> pl.DataFrame:
     """The answer to a query."""
     if _SHOW.fullmatch(sql):
-        return _tables_there_are(others)
+        return _list_tables(others)
     if described := _DESCRIBE.fullmatch(sql):
         return _columns_of(described[1], others)
     _check_query(sql, allow_files)
-    asked = [view for view in views.asked(sql) if not view.needs or view.needs in others]
+    asked = [view for view in views.views_in_query(sql) if not view.needs or view.needs in others]
     # What a view asks is asked too.
     whole = "\n".join([sql, *(view.sql for view in asked)])
     tables = _tables(out, whole)
     try:
         for name, address in others.items():
             tables |= _tables_of_other(address, whole, f"{name}_")
-        frames = tables | views.answered(asked, tables)
+        frames = tables | views.answer_views(asked, tables)
         return pl.SQLContext(frames).execute(sql).collect()
     except (pl.exceptions.PolarsError, pl.exceptions.PanicException, OSError, RecursionError) as error:
         message = (str(error).strip().splitlines() or [type(error).__name__])[0]
-        raise _unanswered(message, tables, others) from None
+        raise _query_error(message, tables, others) from None
 
 
 def _tables_of_other(out: Address, sql: str, prefix: str) -> dict[str, pl.LazyFrame]:
     """The tables and views of a second result that a query names, under its name."""
-    asked = views.asked(sql, prefix)
-    own = "\n".join([*(name for name in _KNOWN if views.names(sql, f"{prefix}{name}")), *(view.sql for view in asked)])
+    asked = views.views_in_query(sql, prefix)
+    own = "\n".join(
+        [*(name for name in _KNOWN if views.may_name(sql, f"{prefix}{name}")), *(view.sql for view in asked)]
+    )
     tables = _tables(out, own)
-    return {f"{prefix}{name}": frame for name, frame in (tables | views.answered(asked, tables)).items()}
+    return {f"{prefix}{name}": frame for name, frame in (tables | views.answer_views(asked, tables)).items()}
 
 
-def _unanswered(message: str, tables: Mapping[str, pl.LazyFrame], others: Iterable[str]) -> UsageError:
+def _query_error(message: str, tables: Mapping[str, pl.LazyFrame], others: Iterable[str]) -> UsageError:
     """Why a query has no answer; of a name that does not exist the three nearest."""
     if unknown := _NO_COLUMN.search(message):
         known = {name for frame in tables.values() for name in frame.collect_schema().names()}
@@ -95,7 +97,7 @@ def _unanswered(message: str, tables: Mapping[str, pl.LazyFrame], others: Iterab
         if view is not None and view.needs:
             remedy = f"`--with {view.needs}=OUT_OLD` names the other one."
             return UsageError("compares two results", place=f"view `{view.name}`", remedy=remedy)
-        known = {*_contracts(others), *views.views()}
+        known = {*_contracts_by_table(others), *views.views()}
         kind = "table"
     else:
         return UsageError(f"cannot be answered: {message}", place="SQL", expected=_EXPECTED, remedy=_REMEDY)
@@ -141,13 +143,14 @@ def _tables(out: Address, sql: str) -> dict[str, pl.LazyFrame]:
     store.complete_runs(out)
 
     def named(known: Iterable[str]) -> list[str]:
-        return [name for name in known if views.names(sql, name)]
+        """Tables among these that the query names."""
+        return [name for name in known if views.may_name(sql, name)]
 
     own = {name: store.read_table(out, name) for name in named(TABLES)}
     return own | _campaign_tables(out, named(CAMPAIGN_TABLES))
 
 
-def _contracts(others: Iterable[str]) -> dict[str, tuple[str, type[dy.Schema]]]:
+def _contracts_by_table(others: Iterable[str]) -> dict[str, tuple[str, type[dy.Schema]]]:
     """Every table that a query may name: the name in the dictionary, and its contract."""
     tables = {**TABLES, **CAMPAIGN_TABLES}
     return {
@@ -155,11 +158,11 @@ def _contracts(others: Iterable[str]) -> dict[str, tuple[str, type[dy.Schema]]]:
     }
 
 
-def _tables_there_are(others: Iterable[str]) -> pl.DataFrame:
+def _list_tables(others: Iterable[str]) -> pl.DataFrame:
     """All tables, with their meaning."""
     rows = [
         (name, len(kind.columns()), " ".join((kind.__doc__ or "").split()))
-        for name, (_, kind) in _contracts(others).items()
+        for name, (_, kind) in _contracts_by_table(others).items()
     ]
     rows += [(view.name, len(view.columns), view.meaning) for view in views.views().values()]
     return pl.DataFrame(rows, schema={"table": pl.String, "columns": pl.Int64, "meaning": pl.String}, orient="row")
@@ -169,7 +172,7 @@ def _columns_of(table: str, others: Iterable[str]) -> pl.DataFrame:
     """Columns of a table, with units and meanings."""
     if (view := views.views().get(table.lower())) is not None:
         return pl.DataFrame(view.columns, schema=["column", "unit", "meaning"], orient="row")
-    known = _contracts(others)
+    known = _contracts_by_table(others)
     contract = known.get(table.lower())
     if contract is None:
         near = " or ".join(f"`{name}`" for name in nearest(table, [*known, *views.views()]))

@@ -21,6 +21,7 @@ def source_of(schema: Mapping[str, pl.DataType], parts: Parts) -> pl.LazyFrame:
     def batches(
         columns: list[str] | None, predicate: pl.Expr | None, most: int | None, _: int | None
     ) -> Iterator[pl.DataFrame]:
+        """Rows of the parts, with the columns asked for, until as many as asked for are there."""
         wanted = columns or list(schema)
         _check_words(predicate, schema)
         yield pl.DataFrame(schema=schema).select(wanted)

@@ -108,7 +108,7 @@ def read_table(out: Address, table: str, run_id: str | None = None) -> pl.LazyFr
     if table not in TABLES:
         raise UsageError("is not a table", place=table, expected=", ".join(TABLES))
     runs = run_ids(out) if run_id is None else [run_id]
-    if run_id is not None and not (_own(out, [run_id]) or packs.find(out, [run_id])):
+    if run_id is not None and not (_runs_with_files(out, [run_id]) or packs.find_packed(out, [run_id])):
         known = ", ".join(run_ids(out)[:10]) or "no complete run"
         raise UsageError(f"has no run {run_id!r}", place=shown(out), found=known)
     return scan_runs(out, table, runs)
@@ -126,14 +126,15 @@ def scan_runs(out: Address, table: str, runs: Sequence[str]) -> pl.LazyFrame:
     """
 
     def parts(columns: list[str], predicate: pl.Expr | None) -> Iterator[pl.DataFrame]:
-        asked = _asked(runs, predicate)
+        """Tables of the runs that the condition leaves, some runs at a time."""
+        asked = _runs_asked_for(runs, predicate)
         for at in range(0, len(asked), _AT_ONCE):
             yield tables_of(out, table, asked[at : at + _AT_ONCE], columns)
 
     return source_of({"run_id": pl.String(), **dtypes(TABLES[table])}, parts)
 
 
-def _asked(runs: Sequence[str], predicate: pl.Expr | None) -> list[str]:
+def _runs_asked_for(runs: Sequence[str], predicate: pl.Expr | None) -> list[str]:
     """The runs that the conditions on `run_id` alone leave."""
     frame = pl.DataFrame({"run_id": runs}, schema={"run_id": pl.String})
     for condition in conjuncts(predicate):
@@ -148,16 +149,16 @@ def tables_of(out: Address, table: str, runs: Sequence[str], columns: Sequence[s
     if not runs:
         return pl.DataFrame(schema={"run_id": pl.String(), **dtypes(TABLES[table])}).select(wanted)
     of_table = [name for name in wanted if name != "run_id"]
-    in_packs = packed(out, runs)
+    in_packs = packed_runs_among(out, runs)
     own = [run for run in runs if run not in in_packs]
     check = partial(_check_columns, table)
     parts = [*_read_own(out, table, own, of_table), *packed_tables.read_rows(out, table, in_packs, of_table, check)]
     heights = {run: height for of_part, _ in parts for run, height in of_part.items()}
     names = pl.Series("run_id", runs, pl.String).gather(np.repeat(np.arange(len(runs)), [heights[run] for run in runs]))
-    return _in_order(runs, heights, [frame for _, frame in parts]).with_columns(names).select(wanted)
+    return _order_rows(runs, heights, [frame for _, frame in parts]).with_columns(names).select(wanted)
 
 
-def _in_order(runs: Sequence[str], heights: Mapping[str, int], parts: Sequence[pl.DataFrame]) -> pl.DataFrame:
+def _order_rows(runs: Sequence[str], heights: Mapping[str, int], parts: Sequence[pl.DataFrame]) -> pl.DataFrame:
     """The rows of the parts, where the runs come in the order of `heights`, in the order of `runs`."""
     whole = parts[0] if len(parts) == 1 else pl.concat(parts)
     if list(heights) == list(runs):
@@ -173,6 +174,7 @@ def _read_own(
     run = ""
 
     def checked(recorded: Mapping[str, pl.DataType]) -> Sequence[str]:
+        """The columns to read, once the file is known to have those of the contract."""
         _check_columns(table, run, recorded)
         return columns
 
@@ -208,26 +210,26 @@ def _check_columns(table: str, run_id: str, recorded: Mapping[str, pl.DataType])
 
 def run_ids(out: Address) -> list[str]:
     """The complete runs of a result, sorted."""
-    return sorted({*own_runs(out), *packs.find(out)})
+    return sorted({*own_runs(out), *packs.find_packed(out)})
 
 
 def own_runs(out: Address) -> list[str]:
     """Runs with files of their own, sorted."""
     folders = [name for name in storage.folders_in(join(out, _MARKER)) if name.startswith("run_id=")]
     runs = sorted(unquote(name.removeprefix("run_id=")) for name in folders)
-    return runs if is_url(out) else _own(out, runs)
+    return runs if is_url(out) else _runs_with_files(out, runs)
 
 
-def _own(out: Address, among: Iterable[str]) -> list[str]:
+def _runs_with_files(out: Address, among: Iterable[str]) -> list[str]:
     """The runs of these that have files of their own."""
     return [run for run in among if exists(table_address(out, _MARKER, run))]
 
 
-def packed(out: Address, among: Iterable[str]) -> dict[str, packs.PackedRun]:
+def packed_runs_among(out: Address, among: Iterable[str]) -> dict[str, packs.PackedRun]:
     """The runs of these that are read from packs, in order."""
-    places = packs.find(out, among)
+    places = packs.find_packed(out, among)
     # A store lists all of them as fast as it answers for a few.
-    own = set(own_runs(out) if is_url(out) and len(places) > 1 else _own(out, places))
+    own = set(own_runs(out) if is_url(out) and len(places) > 1 else _runs_with_files(out, places))
     return {run: place for run, place in places.items() if run not in own}
 
 
@@ -259,7 +261,7 @@ def markers(out: Address, among: Sequence[str] | None = None) -> Iterator[Marker
     runs = run_ids(out) if among is None else among
     for first in range(0, len(runs), _AT_ONCE):
         some = runs[first : first + _AT_ONCE]
-        in_packs = packed(out, some)
+        in_packs = packed_runs_among(out, some)
         places = {run: str(table_address(out, _MARKER, run)) for run in some if run not in in_packs}
         contents = storage.read_many(list(places.values()))
         found = {marker.run_id: marker for marker in packs.markers(out, in_packs)}
@@ -269,17 +271,17 @@ def markers(out: Address, among: Sequence[str] | None = None) -> Iterator[Marker
 
 def packed_frame(out: Address, table: str, run_id: str) -> pl.DataFrame | None:
     """One table of a packed run with whatever columns its build of the program wrote; none of a run with own files."""
-    place = packed(out, [run_id]).get(run_id)
-    return None if place is None else pl.DataFrame(pl.from_arrow(packed_tables.of_run(out, table, place)))
+    place = packed_runs_among(out, [run_id]).get(run_id)
+    return None if place is None else pl.DataFrame(pl.from_arrow(packed_tables.table_of_run(out, table, place)))
 
 
 def content_of(out: Address, table: str, run_id: str) -> bytes | None:
     """The file of one table of a run, or what was its file before it was packed; none where there is neither."""
-    in_packs = packed(out, [run_id])
+    in_packs = packed_runs_among(out, [run_id])
     if not in_packs:
         return storage.content_of(table_address(out, table, run_id))
     (marker,) = packs.markers(out, in_packs)
-    return file_bytes(packed_tables.of_run(out, table, in_packs[run_id]), table, marker.metadata)
+    return file_bytes(packed_tables.table_of_run(out, table, in_packs[run_id]), table, marker.metadata)
 
 
 def file_bytes(rows: pa.Table, table: str, of_marker: Mapping[str, str]) -> bytes:

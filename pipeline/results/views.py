@@ -37,21 +37,21 @@ def views() -> Mapping[str, View]:
     }
 
 
-def asked(sql: str, prefix: str = "") -> list[View]:
+def views_in_query(sql: str, prefix: str = "") -> list[View]:
     """The views that a query names, and those that these name, in an order in which each can be answered."""
-    named = {view.name for view in views().values() if names(sql, f"{prefix}{view.name}")}
+    named = {view.name for view in views().values() if may_name(sql, f"{prefix}{view.name}")}
     for view in reversed(list(views().values())):
         if view.name in named:
-            named |= {other for other in views() if other != view.name and names(view.sql, other)}
+            named |= {other for other in views() if other != view.name and may_name(view.sql, other)}
     return [view for view in views().values() if view.name in named]
 
 
-def names(sql: str, name: str) -> bool:
+def may_name(sql: str, name: str) -> bool:
     """Whether a query may name this table."""
     return re.search(rf"\b{name}\b", sql, re.IGNORECASE) is not None
 
 
-def answered(these: Iterable[View], tables: Mapping[str, pl.LazyFrame]) -> dict[str, pl.LazyFrame]:
+def answer_views(these: Iterable[View], tables: Mapping[str, pl.LazyFrame]) -> dict[str, pl.LazyFrame]:
     """The views by name, each over the tables and the views before it."""
     known = dict(tables)
     found: dict[str, pl.LazyFrame] = {}

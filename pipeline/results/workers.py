@@ -23,9 +23,9 @@ _THREADS = (
 )
 
 
-def mapped(function: Callable[[T], R], tasks: Sequence[T], jobs: int) -> list[R]:
+def map_in_processes(function: Callable[[T], R], tasks: Sequence[T], jobs: int) -> list[R]:
     """`function` of every task; `jobs` processes, or this one for a single job or task."""
-    return [result for _, result in zip(with_progress(tasks), each(function, tasks, jobs), strict=True)]
+    return [result for _, result in zip(with_progress(tasks), each_in_processes(function, tasks, jobs), strict=True)]
 
 
 def with_progress(items: Collection[T]) -> Iterator[T]:
@@ -51,7 +51,7 @@ def watched(progress: Callable[[int, int], None] | None) -> Iterator[None]:
         _PROGRESS.reset(before)
 
 
-def each(function: Callable[[T], R], tasks: Sequence[T], jobs: int) -> Iterator[R]:
+def each_in_processes(function: Callable[[T], R], tasks: Sequence[T], jobs: int) -> Iterator[R]:
     """Results as of `mapped`, one after the other as soon as it and those before it are there."""
     workers = min(jobs, len(tasks))
     if workers <= 1:

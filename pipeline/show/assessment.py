@@ -9,21 +9,21 @@ from typing import Any
 import polars as pl
 
 from pipeline.results.manifest import NAME
-from pipeline.show.terminal import show_tables, tall, to_json
+from pipeline.show.terminal import show_tables, to_json, turn_table
 from pipeline.stages.run_row.bounds import bound_columns
 from pipeline.studies.safety.assessment import SOURCES, Assessment
-from pipeline.studies.safety.budget import published
+from pipeline.studies.safety.budget import published_table
 from schemas.campaign import CampaignFigures
 from schemas.errors import visible
 
 
-def show(assessment: Assessment, as_json: bool) -> None:
+def show_assessment(assessment: Assessment, as_json: bool) -> None:
     """Print it: the verdict, each table, what it means; or all of it as JSON."""
     if as_json:
         print(to_json({"statements": assessment.statements, **assessment.tables}))
         return
     print(visible(assessment.statements[0]) + "\n")
-    show_tables(for_reading(assessment.tables))
+    show_tables(tables_for_reading(assessment.tables))
     print(visible("\n".join(assessment.statements[1:])))
 
 
@@ -43,11 +43,11 @@ _SHORT = {
 }
 
 
-def for_reading(tables: dict[str, pl.DataFrame]) -> dict[str, pl.DataFrame]:
+def tables_for_reading(tables: dict[str, pl.DataFrame]) -> dict[str, pl.DataFrame]:
     """The tables as they fit a screen: without those of single runs, wide ones in fewer columns or turned."""
     figures = figures_for_reading(tables["figures"])
     shown = {
-        "what this result was made from": some_of(tables["sources"]),
+        "what this result was made from": sources_in_short(tables["sources"]),
         "how much the verdict depends on what was chosen": tables["sensitivity"],
         **{f"figures of {name}, with exact 95 % bounds": table for name, table in figures.items()},
         "time to detect and hazardous time": tables["time_to_detect"].select(_SHORT["time_to_detect"]),
@@ -59,16 +59,17 @@ def for_reading(tables: dict[str, pl.DataFrame]) -> dict[str, pl.DataFrame]:
     }
     side = "composite and reactive fail-safety side by side"
     if shown[side].height:
-        shown[side] = tall(shown[side], ("architecture", "solution", "other"))
+        shown[side] = turn_table(shown[side], ("architecture", "solution", "other"))
     return {name: table for name, table in shown.items() if table.height}
 
 
 def figures_for_reading(figures: pl.DataFrame) -> dict[str, pl.DataFrame]:
     """Figures per solution: `figure, value, low, high, unit, source`; bounds are exact, two-sided, 95 %."""
-    return {str(row["solution"]): _figures(row) for row in figures.iter_rows(named=True)}
+    return {str(row["solution"]): _figure_rows(row) for row in figures.iter_rows(named=True)}
 
 
-def _figures(row: Mapping[str, Any]) -> pl.DataFrame:
+def _figure_rows(row: Mapping[str, Any]) -> pl.DataFrame:
+    """The figures of one solution, a row each, with bounds, unit and source."""
     bounds = bound_columns(row)
     not_shown = {"solution", *(name for name in row if re.search("_(low|high)(_|$)", name))}
     rows = [
@@ -85,11 +86,11 @@ def _unit_and_source(name: str) -> tuple[str, str]:
     column = CampaignFigures.columns()[name]
     unit = str((column.metadata or {}).get("unit", "")) or "1"
     # By the beginning of the figure's name, the first that fits; docs/domain.md is DOMAIN.
-    sources = published("figure_sources").iter_rows()
+    sources = published_table("figure_sources").iter_rows()
     return unit, next((source for start, source in sources if name.startswith(start)), "")
 
 
-def some_of(sources: pl.DataFrame, most: int = 8) -> pl.DataFrame:
+def sources_in_short(sources: pl.DataFrame, most: int = 8) -> pl.DataFrame:
     """The sources as they fit a screen: digests shortened, and not all logs of many."""
     logs = sources.filter(pl.col("kind") == "log")
     shown = pl.concat([sources.filter(pl.col("kind") != "log"), logs.head(most)])

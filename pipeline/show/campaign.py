@@ -39,8 +39,8 @@ def summary_line(summary: CampaignSummary) -> str:
     counts = [f"{summary.count(status)} {status.value}" for status in RunStatus]
     figures_words = f"; {verdict_figures_words(figures)}" if (figures := summary.verdict_figures()) else ""
     text = f"{summary.head}{figures_words}; {len(summary.outcomes)} of {summary.planned} runs: " + ", ".join(counts)
-    if summary.skipped:
-        text += f" ({summary.skipped} of them complete before)"
+    if summary.count_skipped:
+        text += f" ({summary.count_skipped} of them complete before)"
     return f"{text}; {duration_text(summary.seconds)}"
 
 
@@ -49,7 +49,13 @@ def ending_rows(summary: CampaignSummary) -> pl.DataFrame:
     ranked = sorted(summary.outcomes, key=lambda outcome: (_WORST_FIRST[word_of(outcome.verdict)], outcome.run_id))
     names = ("verdict", "run_id", "accepted", "available", "margin", "why", "faults")
     rows = [
-        (word_of(outcome.verdict), outcome.run_id, *_outcome_figures(outcome), _reason(outcome), _few(outcome.faults))
+        (
+            word_of(outcome.verdict),
+            outcome.run_id,
+            *_outcome_figures(outcome),
+            _why_words(outcome),
+            _first_faults(outcome.faults),
+        )
         for outcome in ranked
     ]
     return pl.DataFrame(rows, schema=dict.fromkeys(names, pl.String), orient="row")
@@ -85,7 +91,7 @@ def remedy_lines(summary: CampaignSummary, **places: str) -> list[str]:
     ]
 
 
-def _reason(outcome: RunOutcome) -> str:
+def _why_words(outcome: RunOutcome) -> str:
     """What is wrong with the run: why its verdict is no better, what cut it short, what its time was lost to."""
     why = "" if outcome.verdict is RunVerdict.SAFE else outcome.why
     cut = "" if outcome.status is RunStatus.OK else outcome.error or outcome.status.value
@@ -94,7 +100,8 @@ def _reason(outcome: RunOutcome) -> str:
     return "; ".join(text for text in (why, status, lost) if text)
 
 
-def _few(faults: Sequence[str]) -> str:
+def _first_faults(faults: Sequence[str]) -> str:
+    """The first two faults, and how many more there are."""
     more = [f"and {len(faults) - 2} more"] if len(faults) > 2 else []
     return "; ".join([*faults[:2], *more]) or "none"
 
@@ -122,11 +129,12 @@ def outcome_rows(summary: CampaignSummary) -> pl.DataFrame:
         "faults": pl.List(pl.String),
     }
     rows = [
-        (word_of(outcome.verdict), *(_listed(getattr(outcome, name)) for name in list(kinds)[1:]))
+        (word_of(outcome.verdict), *(_as_list(getattr(outcome, name)) for name in list(kinds)[1:]))
         for outcome in summary.outcomes
     ]
     return pl.DataFrame(rows, schema=kinds, orient="row")
 
 
-def _listed(value: object) -> object:
+def _as_list(value: object) -> object:
+    """A tuple as a list, anything else as it is."""
     return list(value) if isinstance(value, tuple) else value

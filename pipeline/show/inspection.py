@@ -85,10 +85,10 @@ def inspect_table(path: Address) -> dict[str, pl.DataFrame]:
     except ParquetError as error:
         raise UsageError(f"cannot be read: {error}", place=redacted(str(path)), expected="a Parquet file") from None
     metadata = {key.removeprefix(PREFIX): value for key, value in found.metadata.items()}
-    return {"File": _figures({"rows": found.rows, **metadata}), "Columns": found.columns}
+    return {"File": _figures_table({"rows": found.rows, **metadata}), "Columns": found.columns}
 
 
-def show(tables: Mapping[str, pl.DataFrame]) -> None:
+def show_inspection(tables: Mapping[str, pl.DataFrame]) -> None:
     """Print the tables; what is to be saved as configuration last, without a frame.
 
     A mapping that comes alone can be saved as it is printed: its comments say what it uses.
@@ -118,7 +118,7 @@ def tables_of_log(
         "chunks_without_crc": log.notes.chunks_without_crc,
         "files_without_crc": list(log.notes.files_without_crc),
     }
-    tables = {"Log": _figures(figures)}
+    tables = {"Log": _figures_table(figures)}
     tables["Streams"] = pl.DataFrame([_stream_row(stream) for stream in log.streams])
     if log.topics:
         tables["Topics"] = pl.DataFrame([_topic_row(topic) for topic in log.topics])
@@ -132,14 +132,16 @@ def tables_of_log(
 
 
 def _stream_row(stream: StreamSummary) -> dict[str, object]:
+    """A stream as a row for people."""
     row = {item.name: getattr(stream, item.name) for item in fields(stream)}
     for name in ("t_start", "t_end"):
         t_ns = row.pop(f"{name}_ns")
         row[name] = None if t_ns is None else datetime.fromtimestamp(t_ns / 1e9, UTC)
-    return {**row, "fix_mix": _value(stream.fix_mix), "columns": " ".join(stream.columns)}
+    return {**row, "fix_mix": _value_words(stream.fix_mix), "columns": " ".join(stream.columns)}
 
 
 def _topic_row(topic: TopicSummary) -> dict[str, object]:
+    """A topic as a row for people."""
     row = {item.name: getattr(topic, item.name) for item in fields(topic) if item.name != "fields"}
     mapping = ", ".join(f"{column} = {source}" for column, source in topic.mapping.items())
     return {**row, "stream": topic.stream or "left over", "mapping": mapping}
@@ -163,7 +165,7 @@ def inspect_site(
     site = read_site(path, config.site)
     findings = (*ambiguities(site, config), *site.findings, *without_balises(site.balises))
     tables = {
-        "Site": _figures(describe_site(site)),
+        "Site": _figures_table(describe_site(site)),
         "Elements": elements_table(site),
         "Neighbours": neighbours(site, config),
         "Findings": findings_table(findings),
@@ -178,11 +180,12 @@ def inspect_result(path: Address) -> dict[str, pl.DataFrame]:
     """The verdict of a result, and its runs in their main figures; null what nobody could count."""
     runs = store.read_table(path, "runs").select(_RUN_COLUMNS).collect()
     head = head_of(run_verdicts(runs).values())
-    return {"Verdict": _figures({"verdict": head.word, **head.counts()}), "Runs": known_counts(runs)}
+    return {"Verdict": _figures_table({"verdict": head.word, **head.counts()}), "Runs": known_counts(runs)}
 
 
-def _figures(figures: Mapping[str, object]) -> pl.DataFrame:
-    return pl.DataFrame({"figure": list(figures), "value": [_value(value) for value in figures.values()]})
+def _figures_table(figures: Mapping[str, object]) -> pl.DataFrame:
+    """Figures by name as a table."""
+    return pl.DataFrame({"figure": list(figures), "value": [_value_words(value) for value in figures.values()]})
 
 
 def findings_table(findings: tuple[Finding, ...]) -> pl.DataFrame:
@@ -192,7 +195,8 @@ def findings_table(findings: tuple[Finding, ...]) -> pl.DataFrame:
     return pl.DataFrame(rows, schema=dict.fromkeys(columns, pl.String), orient="row")
 
 
-def _value(value: object) -> str:
+def _value_words(value: object) -> str:
+    """A value in words."""
     match value:
         case None:
             return "-"
@@ -201,6 +205,6 @@ def _value(value: object) -> str:
         case Mapping():
             return ", ".join(f"{count} {name}" for name, count in value.items()) or "none"
         case tuple():
-            return ", ".join(map(_value, value)) or "none"
+            return ", ".join(map(_value_words, value)) or "none"
         case _:
             return str(value)

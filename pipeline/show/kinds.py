@@ -55,6 +55,7 @@ def kind_at(path: Address) -> Kind:
 
 
 def _holds_run(path: Address) -> bool:
+    """Whether a folder is a result with a complete run."""
     from pipeline.results import store
 
     return bool(store.run_ids(path))

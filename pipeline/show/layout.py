@@ -36,12 +36,12 @@ class Column:
     rank: float = math.inf
 
     @property
-    def natural(self) -> int:
+    def natural_width(self) -> int:
         """Characters that the column takes when nothing is folded."""
         return max(1, *map(len, [self.heading, *self.cells]))
 
     @property
-    def least(self) -> int:
+    def least_width(self) -> int:
         """Characters below which it cannot be read."""
         widest = max(map(len, self.cells), default=0)
         if not self.is_number:
@@ -50,10 +50,10 @@ class Column:
         return max(widest, self.least_heading)
 
     @property
-    def unfolded(self) -> int:
+    def unfolded_width(self) -> int:
         """Characters that leave all but long texts in one line."""
         widest = max(map(len, self.cells), default=0)
-        return max(min(widest, _LONG_TEXT), self.least)
+        return max(min(widest, _LONG_TEXT), self.least_width)
 
     @property
     def is_empty(self) -> bool:
@@ -67,22 +67,22 @@ class Column:
         return max(1, longest, math.ceil(len(self.heading) / _HEADING_LINES))
 
 
-def fitted(columns: Sequence[Column], width: int | None) -> list[str]:
+def fit_table(columns: Sequence[Column], width: int | None) -> list[str]:
     """The lines of a table that is no wider than `width` characters, headings first; None: as wide as it is."""
-    if width is None or _total(naturals := [column.natural for column in columns]) <= width:
-        return _lines(columns, [column.natural for column in columns], broken=False)
-    least = [column.least for column in columns]
-    if _total(least) <= width:
-        return _lines(columns, _shared_out(least, naturals, width), broken=True)
+    if width is None or _total_width(naturals := [column.natural_width for column in columns]) <= width:
+        return _lines(columns, [column.natural_width for column in columns], broken=False)
+    least = [column.least_width for column in columns]
+    if _total_width(least) <= width:
+        return _lines(columns, _share_width(least, naturals, width), broken=True)
     rows = len(columns[0].cells)
     if 0 < rows <= _FEW_ROWS:
-        turned = _turned(columns, rows)
-        if _total([column.least for column in turned]) <= width:
-            return fitted(turned, width)
-    return _what_matters(columns, width)
+        turned = _transpose(columns, rows)
+        if _total_width([column.least_width for column in turned]) <= width:
+            return fit_table(turned, width)
+    return _fit_by_rank(columns, width)
 
 
-def _what_matters(columns: Sequence[Column], width: int) -> list[str]:
+def _fit_by_rank(columns: Sequence[Column], width: int) -> list[str]:
     """The first column with a value and those of the least rank that fit, in their order.
 
     Texts that matter and are long, or do not fit beside the others, stand below each row. The last line says how many
@@ -93,13 +93,13 @@ def _what_matters(columns: Sequence[Column], width: int) -> list[str]:
     below = []
     for column in sorted(others, key=lambda column: column.rank):
         is_text = not column.is_number and column.rank < math.inf
-        fits = _total([item.unfolded for item in (*chosen, column)]) <= width
-        if is_text and (not fits or column.natural > 2 * _LONG_TEXT):
+        fits = _total_width([item.unfolded_width for item in (*chosen, column)]) <= width
+        if is_text and (not fits or column.natural_width > 2 * _LONG_TEXT):
             below.append(column)
         elif fits:
             chosen.append(column)
     kept = [column for column in columns if column in chosen]
-    widths = _shared_out([column.unfolded for column in kept], [column.natural for column in kept], width)
+    widths = _share_width([column.unfolded_width for column in kept], [column.natural_width for column in kept], width)
     out = len(columns) - len(kept) - len(below)
     note = (
         f"{out} of {len(columns)} columns are left out: they do not fit {width} characters or hold"
@@ -108,17 +108,17 @@ def _what_matters(columns: Sequence[Column], width: int) -> list[str]:
     return [*_lines(kept, widths, broken=True, below=below, width=width), *(textwrap.wrap(note, width) if out else [])]
 
 
-def _turned(columns: Sequence[Column], rows: int) -> list[Column]:
+def _transpose(columns: Sequence[Column], rows: int) -> list[Column]:
     """One line per column of the table, one column per row."""
     heads = [""] if rows == 1 else [f"row {number}" for number in range(1, rows + 1)]
     names = Column("", [column.heading for column in columns])
     return [names, *(Column(head, [column.cells[row] for column in columns]) for row, head in enumerate(heads))]
 
 
-def _shared_out(least: list[int], wanted: list[int], width: int) -> list[int]:
+def _share_width(least: list[int], wanted: list[int], width: int) -> list[int]:
     """Widths between `least` and `wanted`: what is left of the width goes to the narrowest wishes first."""
     widths = list(least)
-    spare = width - _total(least)
+    spare = width - _total_width(least)
     wishes = sorted((want - have, at) for at, (want, have) in enumerate(zip(wanted, least, strict=True)))
     for turn, (wish, at) in enumerate(wishes):
         more = max(0, min(wish, spare // (len(wishes) - turn)))
@@ -132,22 +132,25 @@ def _lines(
 ) -> list[str]:
     """Headings and rows; the columns `below` under each row, in lines of at most `width` characters."""
     rights = [column.is_number for column in columns]
-    headings = [_broken_heading(c.heading, w) if broken else [c.heading] for c, w in zip(columns, widths, strict=True)]
+    headings = [_fold_heading(c.heading, w) if broken else [c.heading] for c, w in zip(columns, widths, strict=True)]
     deepest = max(map(len, headings))
-    lines = _row([[""] * (deepest - len(part)) + part for part in headings], widths, rights)
+    lines = _row_lines([[""] * (deepest - len(part)) + part for part in headings], widths, rights)
     if not any(column.heading for column in columns):
         lines = []
     for row, cells in enumerate(zip(*(column.cells for column in columns), strict=True)):
-        lines += _row([_folded(cell, width) for cell, width in zip(cells, widths, strict=True)], widths, rights)
+        lines += _row_lines(
+            [_fold_cell(cell, width) for cell, width in zip(cells, widths, strict=True)], widths, rights
+        )
         for column in below:
             if column.cells[row] not in _NOTHING:
                 lines += [
-                    _INDENT + part for part in _folded(f"{column.heading}: {column.cells[row]}", width - len(_INDENT))
+                    _INDENT + part
+                    for part in _fold_cell(f"{column.heading}: {column.cells[row]}", width - len(_INDENT))
                 ]
     return lines
 
 
-def _row(parts: list[list[str]], widths: list[int], rights: list[bool]) -> list[str]:
+def _row_lines(parts: list[list[str]], widths: list[int], rights: list[bool]) -> list[str]:
     """One row of the table, as many lines as its deepest cell."""
     signs = [">" if right else "<" for right in rights]
     return [
@@ -160,6 +163,7 @@ class _Words(textwrap.TextWrapper):
     """Breaks at blanks; a word that is longer than the line behind its signs."""
 
     def _split(self, text: str) -> list[str]:
+        """Pieces of a text that a line may end behind."""
         return [
             piece
             for word in super()._split(text)
@@ -168,7 +172,8 @@ class _Words(textwrap.TextWrapper):
         ]
 
 
-def _folded(cell: str, width: int) -> list[str]:
+def _fold_cell(cell: str, width: int) -> list[str]:
+    """A cell in lines of at most this width."""
     if len(cell) <= width:
         return [cell]
     return _Words(width, break_on_hyphens=False).wrap(cell) or [""]
@@ -180,9 +185,11 @@ class _Headings(textwrap.TextWrapper):
     wordsep_re = re.compile(r"(\s+|(?<=_))")
 
 
-def _broken_heading(heading: str, width: int) -> list[str]:
+def _fold_heading(heading: str, width: int) -> list[str]:
+    """A heading in lines of at most this width."""
     return _Headings(width).wrap(heading) or [""]
 
 
-def _total(widths: Sequence[int]) -> int:
+def _total_width(widths: Sequence[int]) -> int:
+    """Width of columns with the gaps between them."""
     return sum(widths) + _GAP * (len(widths) - 1)

@@ -57,7 +57,7 @@ def _piece_features(result: LineResult) -> list[dict[str, object]]:
     pieces = result.line.pieces
     shares = np.linspace(0.0, 1.0, 6)
     measures = pieces.from_m[:, None] + (pieces.to_m - pieces.from_m)[:, None] * shares
-    elements = pl.Series(np.repeat(pieces.names, shares.size), dtype=pl.String)
+    elements = pl.Series(np.repeat(pieces.element_names, shares.size), dtype=pl.String)
     lines = _coordinates(result, elements, measures.ravel()).reshape(-1, shares.size, 2).tolist()
     rows = result.pieces.iter_rows(named=True)
     return [_feature("LineString", lines[row["piece"]], {"kind": "piece", **row}) for row in rows]
@@ -80,6 +80,7 @@ def _coordinates(result: LineResult, elements: pl.Series, measures_m: Floats) ->
 
 
 def _feature(kind: str, coordinates: list[object], properties: dict[str, object]) -> dict[str, object]:
+    """A GeoJSON feature."""
     return {"type": "Feature", "geometry": {"type": kind, "coordinates": coordinates}, "properties": properties}
 
 
@@ -88,12 +89,12 @@ def line_page(result: LineResult) -> str:
     pieces = result.pieces
     balises = result.balises
     criteria = result.line.criteria
-    passed = _with_passes(pieces)
+    passed = _passed_pieces(pieces)
     body = "\n".join(
         [
-            _tiles(pieces),
-            section("limits", "What these runs cannot say", _list(result.remarks)),
-            section("line", "The line", _key(), *_strips(result, passed)),
+            _length_tiles(pieces),
+            section("limits", "What these runs cannot say", _html_list(result.remarks)),
+            section("line", "The line", _strip_legend(), *_strips(result, passed)),
             section(
                 "proposals",
                 "Proposals side by side",
@@ -110,7 +111,7 @@ def line_page(result: LineResult) -> str:
     return page(title, heading, body, script_json({}), "line.js", SOFTWARE)
 
 
-def _tiles(pieces: pl.DataFrame) -> str:
+def _length_tiles(pieces: pl.DataFrame) -> str:
     """Tiles with the lengths of suitable, unsuitable and unknown track."""
     tones = {PieceClass.SUITABLE: "good", PieceClass.UNSUITABLE: "bad", PieceClass.UNKNOWN: "doubt"}
     rows = []
@@ -128,18 +129,19 @@ def _tiles(pieces: pl.DataFrame) -> str:
     return tiles(rows)
 
 
-def _with_passes(pieces: pl.DataFrame) -> pl.DataFrame:
+def _passed_pieces(pieces: pl.DataFrame) -> pl.DataFrame:
     """Pieces that some run says something of, what is bad first."""
     spoken = pl.sum_horizontal("passes", "unknown", "after_alarm", "claimed_wrongly") > 0
     order = pl.col("piece_class").cast(pl.String).replace_strict({"unsuitable": 0, "unknown": 1, "suitable": 2})
     return pieces.filter(spoken).sort(order, "piece", "direction", maintain_order=True)
 
 
-def _list(texts: Sequence[str]) -> str:
+def _html_list(texts: Sequence[str]) -> str:
+    """Sentences as a list of HTML."""
     return f'<ul class="notice">{"".join(f"<li>{escape(text)}</li>" for text in texts)}</ul>'
 
 
-def _key() -> str:
+def _strip_legend() -> str:
     """What the signs of the strips mean, for people."""
     words = ", ".join(f"{sign} {cause.value.replace('_', ' ')}" for cause, sign in SIGNS.items())
     return (

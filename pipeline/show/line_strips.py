@@ -43,8 +43,8 @@ class Stretch:
     begin_m: float
     length_m: float
 
-    def at(self, measure_m: float) -> float:
-        """Metres from the begin of the line."""
+    def distance_on_line_m(self, measure_m: float) -> float:
+        """Distance of a measure from the begin of the line [m]."""
         return self.begin_m + (self.length_m - measure_m if self.reversed else measure_m)
 
 
@@ -116,7 +116,7 @@ def _strip(number: int, line: Line, pieces: Mapping[str, pl.DataFrame], balises:
     row_m = _ROW_PIECES * float(first["to_m"] - first["from_m"])
     count = max(1, int(-(-total_m // row_m)))
     title = f"Line {number}: {names}, {total_m / 1000.0:.2f} km"
-    drawn = "".join(_row(row * row_m, row_m, total_m, row * _ROW, line, pieces, balises) for row in range(count))
+    drawn = "".join(_row_svg(row * row_m, row_m, total_m, row * _ROW, line, pieces, balises) for row in range(count))
     return (
         f'<figure id="strip-{number}"><figcaption><h3>{escape(title)}</h3></figcaption><div class="plot strip">'
         f'<svg viewBox="0 0 {_LEFT + _WIDTH + 20:.0f} {count * _ROW:.0f}" role="img" aria-label="{escape(title)}">'
@@ -137,12 +137,12 @@ class _Window:
         """Where a place is drawn; places outside at the edge."""
         return _LEFT + (min(max(at_m, self.begin_m), self.end_m) - self.begin_m) * self.scale
 
-    def holds(self, at_m: float) -> bool:
+    def shows_place(self, at_m: float) -> bool:
         """Whether the strip shows a place."""
         return self.begin_m <= at_m < self.end_m or at_m == self.end_m
 
 
-def _row(
+def _row_svg(
     begin_m: float,
     row_m: float,
     total_m: float,
@@ -153,18 +153,18 @@ def _row(
 ) -> str:
     """Both lanes, balises, an axis in kilometres, and where which net element lies."""
     window = _Window(begin_m, min(begin_m + row_m, total_m), _WIDTH / row_m, top)
-    drawn = [_text(4.0, top + 16, "→"), _text(4.0, top + 42, "←"), *_axis(window)]
+    drawn = [_text_svg(4.0, top + 16, "→"), _text_svg(4.0, top + 42, "←"), *_axis_svg(window)]
     for stretch in line:
         if stretch.begin_m >= window.end_m or stretch.begin_m + stretch.length_m <= window.begin_m:
             continue
-        drawn += [_block(piece, stretch, window) for piece in pieces[stretch.name].iter_rows(named=True)]
-        drawn += _named(stretch, window)
+        drawn += [_piece_svg(piece, stretch, window) for piece in pieces[stretch.name].iter_rows(named=True)]
+        drawn += _name_svg(stretch, window)
         if stretch.name in balises:
-            drawn += _balises(balises[stretch.name], stretch, window)
+            drawn += _balise_svg(balises[stretch.name], stretch, window)
     return "".join(drawn)
 
 
-def _axis(window: _Window) -> Iterator[str]:
+def _axis_svg(window: _Window) -> Iterator[str]:
     """The axis of kilometres."""
     width_km = _WIDTH / window.scale / 1000.0
     step_km = next((step for step in _TICKS_KM if width_km / step <= 12), _TICKS_KM[-1])
@@ -174,36 +174,37 @@ def _axis(window: _Window) -> Iterator[str]:
     while number * step_km * 1000.0 <= window.end_m:
         x = window.x(number * step_km * 1000.0)
         yield f'<path class="line track" d="M{x:.1f} {base:.0f}v5"/>'
-        yield _text(x, base + 17, f"{number * step_km:.4g} km", "middle")
+        yield _text_svg(x, base + 17, f"{number * step_km:.4g} km", "middle")
         number += 1
 
 
-def _named(stretch: Stretch, window: _Window) -> Iterator[str]:
+def _name_svg(stretch: Stretch, window: _Window) -> Iterator[str]:
     """Its name below the axis where there is room, and its begin."""
     x0 = window.x(stretch.begin_m)
     x1 = window.x(stretch.begin_m + stretch.length_m)
-    if window.holds(stretch.begin_m):
+    if window.shows_place(stretch.begin_m):
         yield f'<path class="line soft" d="M{x0:.1f} {window.top + 92:.0f}v16"/>'
     if len(stretch.name) * _LETTER < x1 - x0:
-        yield _text((x0 + x1) / 2, window.top + 104, stretch.name, "middle", "name")
+        yield _text_svg((x0 + x1) / 2, window.top + 104, stretch.name, "middle", "name")
 
 
-def _balises(balises: pl.DataFrame, stretch: Stretch, window: _Window) -> Iterator[str]:
+def _balise_svg(balises: pl.DataFrame, stretch: Stretch, window: _Window) -> Iterator[str]:
     """The balises of a stretch."""
     for at_m, kind in balises.select("measure_m", "kind").iter_rows():
-        if window.holds(stretch.at(at_m)):
+        if window.shows_place(stretch.distance_on_line_m(at_m)):
             sign = "|" if kind == BaliseKind.VIRTUAL.value else "‖"
-            yield _text(window.x(stretch.at(at_m)), window.top + 66, sign, "middle")
+            yield _text_svg(window.x(stretch.distance_on_line_m(at_m)), window.top + 66, sign, "middle")
 
 
-def _text(x: float, y: float, words: str, anchor: str = "start", kind: str = "") -> str:
+def _text_svg(x: float, y: float, words: str, anchor: str = "start", kind: str = "") -> str:
+    """A text of SVG."""
     look = f' class="{kind}"' if kind else ""
     return f'<text{look} x="{x:.1f}" y="{y:.0f}" text-anchor="{anchor}">{escape(words)}</text>'
 
 
-def _block(piece: Mapping[str, Any], stretch: Stretch, window: _Window) -> str:
+def _piece_svg(piece: Mapping[str, Any], stretch: Stretch, window: _Window) -> str:
     """A piece in the lane of its direction on the line; nothing where it lies in another row."""
-    first, last = sorted((stretch.at(piece["from_m"]), stretch.at(piece["to_m"])))
+    first, last = sorted((stretch.distance_on_line_m(piece["from_m"]), stretch.distance_on_line_m(piece["to_m"])))
     if last <= window.begin_m or first >= window.end_m:
         return ""
     kind = PieceClass(piece["piece_class"])
@@ -216,7 +217,7 @@ def _block(piece: Mapping[str, Any], stretch: Stretch, window: _Window) -> str:
     summary = f"{kind.value}, {cause.value}; {piece['passes']} passes, {piece['lost']} lost"
     place = f"{stretch.name}, {piece['from_m']:.0f} to {piece['to_m']:.0f} m, {piece['direction']}"
     sign = SIGNS.get(cause, "") if kind is PieceClass.UNSUITABLE else ""
-    letter = _text(x + width / 2, top + 16, sign, "middle", "name") if sign else ""
+    letter = _text_svg(x + width / 2, top + 16, sign, "middle", "name") if sign else ""
     return (
         f'<g><title>{escape(f"{place}: {summary}")}</title><rect class="bars tone-{_TONES[kind]}" x="{x:.1f}" '
         f'y="{top + _LANE - height:.0f}" width="{width:.1f}" height="{height:.0f}"/>{letter}</g>'

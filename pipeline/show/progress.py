@@ -53,10 +53,10 @@ class CampaignWatch:
         self.done += 1
         self.failed += outcome.status is not RunStatus.OK
         self.skipped += outcome.skipped
-        self.counted(outcome)
+        self.show_outcome(outcome)
 
-    def counted(self, outcome: RunOutcome) -> None:
-        """A run that has ended, after it was counted."""
+    def show_outcome(self, outcome: RunOutcome) -> None:
+        """Show a run that has ended, once it is counted."""
         if outcome.status is not RunStatus.OK:
             self.noted(outcome_line(outcome))
 
@@ -77,9 +77,9 @@ class CampaignWatch:
 
     def line(self, under_way: UnderWay = ()) -> str:
         """One line: done, failed, rate, time left, slow runs."""
-        return ", ".join([f"{self.done}/{self.total} runs", *self.parts(under_way)])
+        return ", ".join([f"{self.done}/{self.total} runs", *self.line_parts(under_way)])
 
-    def parts(self, under_way: UnderWay = ()) -> list[str]:
+    def line_parts(self, under_way: UnderWay = ()) -> list[str]:
         """What is said with how many are done, what matters most first."""
         parts = [f"{self.failed} failed or partial"]
         if self.skipped:
@@ -94,11 +94,11 @@ class CampaignWatch:
         """The same for programs."""
         counts = {"done": self.done, "failed": self.failed, "skipped": self.skipped, "total": self.total}
         slow = [{"run_id": run, "seconds": round(age_s, 3)} for run, age_s in slowest(under_way)]
-        times = {"rate_per_s": _rounded(self.rate_per_s), "left_s": _rounded(self.left_s)}
+        times = {"rate_per_s": _round_figure(self.rate_per_s), "left_s": _round_figure(self.left_s)}
         return {**counts, **times, "slow": slow}
 
 
-def as_fits(parts: Sequence[str], room: int) -> str:
+def join_fitting(parts: Sequence[str], room: int) -> str:
     """As many of the parts as `room` characters take, the first in any case."""
     text = parts[0]
     for part in parts[1:]:
@@ -113,7 +113,8 @@ def slowest(under_way: UnderWay) -> list[tuple[str, float]]:
     return sorted(under_way, key=lambda item: -item[1])[:2]
 
 
-def _rounded(value: float | None) -> float | None:
+def _round_figure(value: float | None) -> float | None:
+    """A figure with three decimals, None where not known."""
     return None if value is None else round(value, 3)
 
 
@@ -154,9 +155,9 @@ class JsonWatch(LineWatch):
 
     def progress(self, under_way: UnderWay) -> None:
         """Say where the campaign stands now."""
-        self._say("progress", **self.figures(under_way))
+        self._print_event("progress", **self.figures(under_way))
 
-    def counted(self, outcome: RunOutcome) -> None:
+    def show_outcome(self, outcome: RunOutcome) -> None:
         """Say what became of a run."""
         names = (
             *("run_id", "status", "error", "skipped", "attempts", "hazards", "missed_detections"),
@@ -171,17 +172,18 @@ class JsonWatch(LineWatch):
             ),
         )
         fields = {"verdict": word_of(outcome.verdict), **{name: getattr(outcome, name) for name in names}}
-        self._say("run", **fields | {"seconds": round(outcome.seconds, 3)} | self.figures())
+        self._print_event("run", **fields | {"seconds": round(outcome.seconds, 3)} | self.figures())
 
     def lost(self, run_id: str, attempt: int) -> None:
         """Say that the worker of a run died."""
-        self._say("lost", run_id=run_id, attempt=attempt)
+        self._print_event("lost", run_id=run_id, attempt=attempt)
 
     def noted(self, text: str) -> None:
         """Say a sentence."""
-        self._say("note", text=text)
+        self._print_event("note", text=text)
 
-    def _say(self, event: str, **fields: object) -> None:
+    def _print_event(self, event: str, **fields: object) -> None:
+        """Print an event as one line of JSON."""
         super().noted(json.dumps({"event": event, **fields}))
 
 
@@ -203,7 +205,7 @@ class BarWatch(CampaignWatch):
     def look(self, under_way: UnderWay) -> None:
         """Bring the bar up to date."""
         room = self._bar.console.width - _BAR - _COUNTS
-        text = as_fits(self.parts(under_way), room)
+        text = join_fitting(self.line_parts(under_way), room)
         self._bar.update(self._task, completed=self.done, description=text)
 
     def noted(self, text: str) -> None:
@@ -228,7 +230,7 @@ class LogWatch(CampaignWatch):
         self._lines = list[str]()
         self.noted(f"{SOFTWARE}: {runs} runs")
 
-    def counted(self, outcome: RunOutcome) -> None:
+    def show_outcome(self, outcome: RunOutcome) -> None:
         """Write what became of a run, with the trace of a defect."""
         self.noted(outcome_line(outcome))
         if outcome.trace:
@@ -285,7 +287,7 @@ def show_summary(
 def summary_answer(summary: CampaignSummary, out: str) -> dict[str, object]:
     """The same for programs."""
     head = {"verdict": summary.head.word, "verdicts": summary.head.counts(), **summary.verdict_figures()}
-    figures = {"planned": summary.planned, "left": summary.left, "skipped": summary.skipped}
+    figures = {"planned": summary.planned, "left": summary.count_left, "skipped": summary.count_skipped}
     return {**head, **figures, "seconds": round(summary.seconds, 3), "out": out, "runs": outcome_rows(summary)}
 
 

@@ -17,11 +17,12 @@ Scale = Callable[[float], float]
 Point = tuple[float, float]
 
 
-def linear(value: float) -> float:
+def linear_scale(value: float) -> float:
+    """The value itself, for axes without a scale."""
     return value
 
 
-def both_ways_log(value: float) -> float:
+def symmetric_log_scale(value: float) -> float:
     """Linear about zero, logarithmic far from it, for times before and after."""
     return log10(1.0 + abs(value)) * (1.0 if value >= 0.0 else -1.0)
 
@@ -34,7 +35,7 @@ class Axis:
     low: float
     high: float
     ticks: Sequence[float]
-    scale: Scale = linear
+    scale: Scale = linear_scale
 
     def share(self, value: float) -> float:
         """Where on the axis, 0 to 1; what lies beyond stands at its end."""
@@ -64,7 +65,7 @@ def even_ticks(low: float, high: float) -> list[float]:
 
 def plot(title: str, x: Axis, y: Axis, curves: Sequence[Curve]) -> str:
     """The whole picture as one SVG element."""
-    parts = [*_frame(x, y), *(part for curve in curves for part in _curve(curve, x, y)), *_key(curves)]
+    parts = [*_frame_svg(x, y), *(part for curve in curves for part in _curve_svg(curve, x, y)), *_legend_svg(curves)]
     return svg(title, HEIGHT, parts)
 
 
@@ -77,41 +78,47 @@ def svg(title: str, height: float, parts: Sequence[str]) -> str:
     )
 
 
-def text(x: float, y: float, words: str, anchor: str = "start") -> str:
+def svg_text(x: float, y: float, words: str, anchor: str = "start") -> str:
+    """A text of SVG."""
     return f'<text x="{x:.1f}" y="{y:.1f}" text-anchor="{anchor}" fill="#222222">{escape(words)}</text>'
 
 
-def _across(axis: Axis, value: float) -> float:
+def _x_of(axis: Axis, value: float) -> float:
+    """Where a value of the horizontal axis is drawn."""
     return _LEFT + axis.share(value) * (_RIGHT - _LEFT)
 
 
-def _up(axis: Axis, value: float) -> float:
+def _y_of(axis: Axis, value: float) -> float:
+    """Where a value of the vertical axis is drawn."""
     return _BOTTOM - axis.share(value) * (_BOTTOM - _TOP)
 
 
-def _frame(x: Axis, y: Axis) -> list[str]:
+def _frame_svg(x: Axis, y: Axis) -> list[str]:
+    """The frame of a plot with its axes."""
     size = f'width="{_RIGHT - _LEFT}" height="{_BOTTOM - _TOP}"'
     box = f'<rect x="{_LEFT}" y="{_TOP}" {size} fill="none" stroke="#888888"/>'
-    parts = [box, text((_LEFT + _RIGHT) / 2, HEIGHT - 8, x.title, "middle"), text(_LEFT, _TOP - 4, y.title)]
+    parts = [box, svg_text((_LEFT + _RIGHT) / 2, HEIGHT - 8, x.title, "middle"), svg_text(_LEFT, _TOP - 4, y.title)]
     for value in x.ticks:
-        at = _across(x, value)
-        parts += [_line(at, _TOP, at, _BOTTOM), text(at, _BOTTOM + 16, f"{value:g}", "middle")]
+        at = _x_of(x, value)
+        parts += [_line_svg(at, _TOP, at, _BOTTOM), svg_text(at, _BOTTOM + 16, f"{value:g}", "middle")]
     for value in y.ticks:
-        at = _up(y, value)
-        parts += [_line(_LEFT, at, _RIGHT, at), text(_LEFT - 6, at + 4, f"{value:g}", "end")]
+        at = _y_of(y, value)
+        parts += [_line_svg(_LEFT, at, _RIGHT, at), svg_text(_LEFT - 6, at + 4, f"{value:g}", "end")]
     return parts
 
 
-def _line(x1: float, y1: float, x2: float, y2: float) -> str:
+def _line_svg(x1: float, y1: float, x2: float, y2: float) -> str:
+    """A line of the grid."""
     return f'<line x1="{x1:.1f}" y1="{y1:.1f}" x2="{x2:.1f}" y2="{y2:.1f}" stroke="#dddddd"/>'
 
 
-def _curve(curve: Curve, x: Axis, y: Axis) -> list[str]:
-    at = [(_across(x, px), _up(y, py)) for px, py in curve.points if isfinite(py)]
+def _curve_svg(curve: Curve, x: Axis, y: Axis) -> list[str]:
+    """A curve with its band."""
+    at = [(_x_of(x, px), _y_of(y, py)) for px, py in curve.points if isfinite(py)]
     parts = []
     if curve.band:
-        lows = [(_across(x, px), _up(y, low)) for (px, _), (low, _) in zip(curve.points, curve.band, strict=True)]
-        highs = [(_across(x, px), _up(y, high)) for (px, _), (_, high) in zip(curve.points, curve.band, strict=True)]
+        lows = [(_x_of(x, px), _y_of(y, low)) for (px, _), (low, _) in zip(curve.points, curve.band, strict=True)]
+        highs = [(_x_of(x, px), _y_of(y, high)) for (px, _), (_, high) in zip(curve.points, curve.band, strict=True)]
         parts.append(
             f'<polygon points="{_svg_points([*lows, *reversed(highs)])}" fill="{curve.colour}" opacity="0.06"/>'
         )
@@ -121,18 +128,20 @@ def _curve(curve: Curve, x: Axis, y: Axis) -> list[str]:
         f"<title>{escape(curve.name)}</title></polyline>"
     )
     for px, py in curve.marks:
-        left = _across(x, px)
-        top = _up(y, py)
+        left = _x_of(x, px)
+        top = _y_of(y, py)
         corners = [(left - 5, top + 4), (left + 5, top + 4), (left, top - 5)]
         parts.append(f'<polygon points="{_svg_points(corners)}" fill="#ffffff" stroke="{curve.colour}"/>')
     return parts
 
 
 def _svg_points(points: Sequence[Point]) -> str:
+    """Points as an attribute of SVG."""
     return " ".join(f"{px:.1f},{py:.1f}" for px, py in points)
 
 
-def _key(curves: Sequence[Curve]) -> list[str]:
+def _legend_svg(curves: Sequence[Curve]) -> list[str]:
+    """The names of the curves."""
     parts = []
     left = _RIGHT + 10
     for number, curve in enumerate(curves):
@@ -141,7 +150,7 @@ def _key(curves: Sequence[Curve]) -> list[str]:
         parts.append(
             f'<line x1="{left}" y1="{at}" x2="{left + 24}" y2="{at}" stroke="{curve.colour}" stroke-width="2"{dash}/>'
         )
-        parts.append(text(_RIGHT + 40, at + 4, curve.name))
+        parts.append(svg_text(_RIGHT + 40, at + 4, curve.name))
     return parts
 
 
@@ -161,26 +170,27 @@ class Piece:
     words: str
 
 
-def strips(title: str, rows: Mapping[str, Sequence[Piece]], scales: Mapping[str, Sequence[float]]) -> str:
+def strips_svg(title: str, rows: Mapping[str, Sequence[Piece]], scales: Mapping[str, Sequence[float]]) -> str:
     """A strip for each of the named rows of pieces, in order; a lane for each scale: its limits between five shades."""
     longest_m = max(row[-1].end_m - row[0].begin_m for row in rows.values())
     parts = []
     top = 8.0
     for name, row in rows.items():
         begin_m = row[0].begin_m
-        parts.append(text(8.0, top + 24.0, f"{name} from {begin_m:.0f} m"))
+        parts.append(svg_text(8.0, top + 24.0, f"{name} from {begin_m:.0f} m"))
         for piece in row:
             left = _STRIP_LEFT + (piece.begin_m - begin_m) / longest_m * _STRIP_WIDTH
             width = (piece.end_m - piece.begin_m) / longest_m * _STRIP_WIDTH - 0.6
             for lane, (value, limits) in enumerate(zip(piece.values, scales.values(), strict=True)):
-                parts.append(_block(left, top + lane * _LANE, width, value, limits, piece.words))
+                parts.append(_piece_svg(left, top + lane * _LANE, width, value, limits, piece.words))
         top += len(scales) * _LANE + 10.0
     for number, (what, limits) in enumerate(scales.items()):
-        parts += _shades(top + 8.0 + 18.0 * number, what, limits)
+        parts += _shade_legend_svg(top + 8.0 + 18.0 * number, what, limits)
     return svg(title, top + 8.0 + 18.0 * len(scales), parts)
 
 
-def _block(left: float, top: float, width: float, value: float | None, limits: Sequence[float], words: str) -> str:
+def _piece_svg(left: float, top: float, width: float, value: float | None, limits: Sequence[float], words: str) -> str:
+    """A piece of a strip, shaded by its value."""
     colour = "#ffffff" if value is None else _SHADES[sum(value > limit for limit in limits)]
     return (
         f'<rect x="{left:.1f}" y="{top:.1f}" width="{max(width, 1.0):.1f}" height="{_LANE - 2:.0f}" fill="{colour}" '
@@ -188,11 +198,12 @@ def _block(left: float, top: float, width: float, value: float | None, limits: S
     )
 
 
-def _shades(top: float, what: str, limits: Sequence[float]) -> list[str]:
+def _shade_legend_svg(top: float, what: str, limits: Sequence[float]) -> list[str]:
+    """What the shades of a lane mean."""
     names = [f"to {limits[0]:g}", *(f"to {limit:g}" for limit in limits[1:]), f"over {limits[-1]:g}"]
-    parts = [text(8.0, top + 11.0, what)]
+    parts = [svg_text(8.0, top + 11.0, what)]
     for number, (name, shade) in enumerate(zip(names, _SHADES, strict=True)):
         left = _STRIP_LEFT + 110.0 * number
         parts.append(f'<rect x="{left:.0f}" y="{top:.0f}" width="14" height="13" fill="{shade}" stroke="#999999"/>')
-        parts.append(text(left + 20.0, top + 11.0, name))
+        parts.append(svg_text(left + 20.0, top + 11.0, name))
     return parts

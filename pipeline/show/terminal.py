@@ -16,7 +16,7 @@ from typing import Any
 
 import polars as pl
 
-from pipeline.show.layout import Column, fitted
+from pipeline.show.layout import Column, fit_table
 from schemas.errors import visible
 
 _SAID_EVERY_S = 5.0
@@ -41,7 +41,7 @@ def show_table(frame: pl.DataFrame, title: str = "") -> None:
     lines = table_lines(frame, screen_width())
     if sys.stdout.isatty() and not os.environ.get("NO_COLOR"):
         title = f"{_BOLD}{title}{_PLAIN}" if title else ""
-        lines = [_coloured(line) for line in lines]
+        lines = [_colour_verdicts(line) for line in lines]
     print("\n".join([title, *lines] if title else lines))
     if frame.width and not frame.height:
         print("(no rows)")
@@ -65,13 +65,14 @@ def show_text(text: str) -> None:
 def table_lines(frame: pl.DataFrame, width: int | None = None) -> list[str]:
     """A frame as aligned text, two blanks between columns, in lines of at most `width` characters."""
     columns = [
-        Column(name, [_text(value) for value in frame[name].to_list()], dtype.is_numeric(), _rank(name))
+        Column(name, [_value_text(value) for value in frame[name].to_list()], dtype.is_numeric(), _column_rank(name))
         for name, dtype in frame.schema.items()
     ]
-    return fitted(columns, width) if columns else []
+    return fit_table(columns, width) if columns else []
 
 
-def _rank(name: str) -> float:
+def _column_rank(name: str) -> float:
+    """How much a column matters; the smaller, the more."""
     return _MATTERS.index(name) if name in _MATTERS else math.inf
 
 
@@ -82,21 +83,22 @@ def screen_width() -> int | None:
     return None
 
 
-def _coloured(line: str) -> str:
+def _colour_verdicts(line: str) -> str:
+    """A line with its verdicts coloured."""
     return _VERDICT_WORD.sub(lambda match: f"{_COLOURS[match[0]]}{match[0]}{_PLAIN}", line)
 
 
-def tall(frame: pl.DataFrame, keys: tuple[str, ...]) -> pl.DataFrame:
+def turn_table(frame: pl.DataFrame, keys: tuple[str, ...]) -> pl.DataFrame:
     """A wide table turned: one line per column, one column per row, headed by its keys."""
     heads = [" ".join(str(part) for part in row if part not in (None, "")) for row in frame.select(keys).iter_rows()]
     names = [name for name in frame.columns if name not in keys]
-    rows = [(name, *(_text(value) for value in frame[name].to_list())) for name in names]
+    rows = [(name, *(_value_text(value) for value in frame[name].to_list())) for name in names]
     return pl.DataFrame(rows, schema=dict.fromkeys(["figure", *heads], pl.String), orient="row")
 
 
 def to_json(value: Any) -> str:
     """JSON of frames, instants and plain values; what is not known is null."""
-    text = json.dumps(_plain(value), indent=2, sort_keys=False, ensure_ascii=False)
+    text = json.dumps(_plain_value(value), indent=2, sort_keys=False, ensure_ascii=False)
     return _STEERING.sub(lambda match: f"\\u{ord(match[0]):04x}", text)
 
 
@@ -111,7 +113,8 @@ def duration_text(seconds: float) -> str:
     return f"{minutes // 60} h {minutes % 60} min"
 
 
-def _text(value: object) -> str:
+def _value_text(value: object) -> str:
+    """A value as text of a table."""
     match value:
         case None:
             return "-"
@@ -122,19 +125,20 @@ def _text(value: object) -> str:
         case datetime():
             return value.isoformat(sep=" ", timespec="milliseconds").removesuffix("+00:00")
         case list():
-            return " ".join(map(_text, value))
+            return " ".join(map(_value_text, value))
         case _:
             return visible(str(value)).replace("\n", r"\n")
 
 
-def _plain(value: Any) -> Any:
+def _plain_value(value: Any) -> Any:
+    """A value as JSON holds it."""
     match value:
         case pl.DataFrame():
-            return [_plain(row) for row in value.iter_rows(named=True)]
+            return [_plain_value(row) for row in value.iter_rows(named=True)]
         case dict():
-            return {str(key): _plain(item) for key, item in value.items()}
+            return {str(key): _plain_value(item) for key, item in value.items()}
         case list() | tuple():
-            return [_plain(item) for item in value]
+            return [_plain_value(item) for item in value]
         case datetime():
             return value.isoformat()
         case float() if not math.isfinite(value):
@@ -145,7 +149,7 @@ def _plain(value: Any) -> Any:
             return str(value)
 
 
-def how_far(things: str) -> Callable[[int, int], None]:
+def progress_printer(things: str) -> Callable[[int, int], None]:
     """Says on standard error how many of how many things are done: in one line that changes, in a pipe every 5 s.
 
     The time left is that of the things done so far, which need not take as long as the others.
@@ -154,7 +158,8 @@ def how_far(things: str) -> Callable[[int, int], None]:
     begun_s = time.monotonic()
     said_s = time.monotonic() - (_SAID_EVERY_S if on_terminal else 0.0)
 
-    def progress(done: int, total: int) -> None:
+    def print_progress(done: int, total: int) -> None:
+        """Print how many are done, every so often."""
         nonlocal said_s
         last = on_terminal and done == total
         if last or time.monotonic() - said_s >= (_CHANGED_EVERY_S if on_terminal else _SAID_EVERY_S):
@@ -165,4 +170,4 @@ def how_far(things: str) -> Callable[[int, int], None]:
             begin, end = ("\r\x1b[K", "\n" if last else "") if on_terminal else ("", "\n")
             print(f"{begin}{text}", end=end, file=sys.stderr, flush=True)
 
-    return progress
+    return print_progress

@@ -15,7 +15,7 @@ from schemas.words import say, say_of
 _FAILED = pl.col("status").cast(pl.String) == RunStatus.FAILED.value
 
 
-def sentences(section: str, said: Mapping[str, object]) -> list[str]:
+def reservation_sentences(section: str, said: Mapping[str, object]) -> list[str]:
     """The words of what there is: falsy means that there is nothing to say.
 
     A tuple holds several figures, a mapping holds them by name (`schemas.words.say_of`).
@@ -36,7 +36,7 @@ def failed_runs(runs: pl.DataFrame) -> list[str]:
     whole = runs.filter(_FAILED.all().over("run_id"))["run_id"].n_unique()
     alone = runs.filter(_FAILED & ~_FAILED.all().over("run_id")).group_by("solution").agg(pl.col("run_id").n_unique())
     return [
-        *sentences("studies", {"failed": whole and (whole, number)}),
+        *reservation_sentences("studies", {"failed": whole and (whole, number)}),
         *(say("studies", "failed_alone", *row, number) for row in alone.sort("solution").iter_rows()),
     ]
 
@@ -44,10 +44,10 @@ def failed_runs(runs: pl.DataFrame) -> list[str]:
 def runs_without_truth(runs: pl.DataFrame, consequence: str) -> list[str]:
     """Runs that nothing but the odometer, or nothing at all, can judge."""
     blind = runs.filter(~pl.col("evidence").cast(pl.String).is_in(TRUTH).fill_null(value=False)).height
-    return sentences("studies", {"without_truth": blind and (blind, runs.height, consequence)})
+    return reservation_sentences("studies", {"without_truth": blind and (blind, runs.height, consequence)})
 
 
 def several_settings(runs: pl.DataFrame, consequence: str) -> list[str]:
     """Runs of different configurations or vehicle files in one result."""
     kinds = runs.filter(~_FAILED)["config_digest"].n_unique()
-    return sentences("studies", {"several_settings": kinds > 1 and (kinds, consequence)})
+    return reservation_sentences("studies", {"several_settings": kinds > 1 and (kinds, consequence)})

@@ -19,7 +19,7 @@ from pipeline.stages.run_row.bounds import (
     poisson_rate,
     poisson_rate_upper,
 )
-from pipeline.studies.reservations import sentences
+from pipeline.studies.reservations import reservation_sentences
 from schemas.enums import RunVerdict
 from schemas.frozen import frozen
 
@@ -54,7 +54,7 @@ def share_shown(bad: int, judged: int, unjudged: int, limit: float, confidence: 
     low = clopper_pearson(bad, number, confidence).low
     high = clopper_pearson(bad + unjudged, number, confidence).high
     needed = trials_needed(bad + unjudged, number, limit, confidence)
-    return Shown(_finding(low, high, limit), Estimate(bad / judged if judged else None, low, high), needed)
+    return Shown(_compliance(low, high, limit), Estimate(bad / judged if judged else None, low, high), needed)
 
 
 def rate_shown(events: int, possible: int, hours: float, hours_known: float, limit_per_h: float) -> Shown:
@@ -63,11 +63,11 @@ def rate_shown(events: int, possible: int, hours: float, hours_known: float, lim
     `possible`: how many events there may be at most with all that is not known; the rate itself is of the known hours.
     """
     low = poisson_rate(events, hours).low
-    finding = _finding(low, poisson_rate_upper(possible, hours), limit_per_h)
+    finding = _compliance(low, poisson_rate_upper(possible, hours), limit_per_h)
     return Shown(finding, poisson_rate(events, hours_known), hours_still_needed(limit_per_h, possible, hours))
 
 
-def _finding(low: float | None, high: float | None, limit: float) -> Compliance:
+def _compliance(low: float | None, high: float | None, limit: float) -> Compliance:
     """Whether a limit is met, by the bounds of what was counted."""
     if high is not None and high <= limit:
         return Compliance.MET
@@ -78,6 +78,7 @@ def trials_needed(bad: int, number: int, limit: float, confidence: float = CONFI
     """Good trials after `bad` of `number` until the upper bound of the share keeps the limit; None beyond 2^40."""
 
     def enough(more: int) -> bool:
+        """Whether so many more good trials keep the limit."""
         high = clopper_pearson(bad, number + more, confidence).high
         return high is not None and high <= limit
 
@@ -91,7 +92,7 @@ def trials_needed(bad: int, number: int, limit: float, confidence: float = CONFI
     return most
 
 
-def distinct(runs: pl.DataFrame) -> tuple[pl.DataFrame, list[str]]:
+def without_repeated_journeys(runs: pl.DataFrame) -> tuple[pl.DataFrame, list[str]]:
     """Rows of `runs` by run and solution without further recordings or replays of one journey, and a remark on them.
 
     Runs of one solution that begin and end at the same nanoseconds and went as far are one journey: one log under two
@@ -110,4 +111,4 @@ def distinct(runs: pl.DataFrame) -> tuple[pl.DataFrame, list[str]]:
     ended = pl.col("t_end").shift().cum_max().over("solution")
     overlapping = kept.sort("solution", "t_start").filter(pl.col("t_start") < ended).height
     said = {"one_journey": runs.height - kept.height, "overlapping": overlapping}
-    return kept.sort("run_id", "solution"), sentences("studies", said)
+    return kept.sort("run_id", "solution"), reservation_sentences("studies", said)

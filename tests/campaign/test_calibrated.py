@@ -14,9 +14,9 @@ from cli import app
 from datasets.trial import write_run_log, write_site
 from pipeline.campaign import Plan, make_plan, run_campaign
 from pipeline.campaign import calibrated as calibrated_module
-from pipeline.campaign.calibrated import calibrated
+from pipeline.campaign.calibrated import calibrate_plan
 from pipeline.campaign.plan import RunJob
-from pipeline.results.workers import mapped
+from pipeline.results.workers import map_in_processes
 from schemas.config import Vehicle
 from schemas.errors import UsageError
 from tests.campaign.compare import campaign_bytes, result_bytes
@@ -46,7 +46,7 @@ def plan_of(trial: Path, out: Path, *folders: str, names: Sequence[str] = ()) ->
 
 
 def auto(plan: Plan) -> Plan:
-    return calibrated(plan, ["auto"])
+    return calibrate_plan(plan, ["auto"])
 
 
 _SEEN: dict[str, Any] = {}
@@ -59,7 +59,7 @@ def remembered(monkeypatch: pytest.MonkeyPatch) -> None:
     def each_once(function: Callable[[RunJob], Any], tasks: Sequence[RunJob], jobs: int) -> list[Any]:
         return [_SEEN.setdefault(task.address, _SEEN.get(task.address) or function(task)) for task in tasks]
 
-    monkeypatch.setattr(calibrated_module, "mapped", each_once)
+    monkeypatch.setattr(calibrated_module, "map_in_processes", each_once)
 
 
 @pytest.mark.usefixtures("in_process", "remembered")
@@ -92,7 +92,7 @@ class TestAuto:
     ) -> None:
         run_campaign(auto(plan_of(trial, tmp_path / "one", "runs")))
         with monkeypatch.context() as measured_again:
-            measured_again.setattr(calibrated_module, "mapped", mapped)
+            measured_again.setattr(calibrated_module, "map_in_processes", map_in_processes)
             run_campaign(auto(plan_of(trial, tmp_path / "other", names=NOISY[::-1])))
         assert result_bytes(tmp_path / "one") == result_bytes(tmp_path / "other")
         assert campaign_bytes(tmp_path / "one") == campaign_bytes(tmp_path / "other")
@@ -123,28 +123,28 @@ class TestAuto:
 @pytest.mark.usefixtures("in_process", "remembered")
 class TestGivenRuns:
     def test_they_calibrate_all_runs_but_themselves(self, trial: Path, tmp_path: Path) -> None:
-        plan = calibrated(plan_of(trial, tmp_path, "faulty"), [str(trial / "runs")])
+        plan = calibrate_plan(plan_of(trial, tmp_path, "faulty"), [str(trial / "runs")])
         (job,) = plan.jobs
         assert list(job.config.calibration.runs) == NOISY
         assert (plan.config, plan.vehicle) == (job.config, job.vehicle)
-        both = calibrated(plan_of(trial, tmp_path, "faulty", names=["ride1"]), [str(trial / "runs")])
+        both = calibrate_plan(plan_of(trial, tmp_path, "faulty", names=["ride1"]), [str(trial / "runs")])
         assert [list(job.config.calibration.runs) for job in both.jobs] == [NOISY[1:], NOISY]
 
     def test_what_the_vehicle_file_says_beside_scale_and_latency_stays(self, trial: Path, tmp_path: Path) -> None:
         vehicle = Vehicle(antenna_height_m=3.9, odometer_scale=0.9)
         plan = make_plan([str(trial / "faulty")], trial / "site", tmp_path, vehicle=vehicle)
-        (job,) = calibrated(plan, [str(trial / "runs")]).jobs
+        (job,) = calibrate_plan(plan, [str(trial / "runs")]).jobs
         assert job.vehicle.antenna_height_m == 3.9
         assert job.vehicle.odometer_scale == pytest.approx(1.002, abs=5e-4)
 
     def test_a_faulty_run_is_refused(self, trial: Path, tmp_path: Path) -> None:
         with pytest.raises(UsageError, match="cannot calibrate") as error:
-            calibrated(plan_of(trial, tmp_path, "runs"), [str(trial / "runs"), str(trial / "faulty")])
+            calibrate_plan(plan_of(trial, tmp_path, "runs"), [str(trial / "runs"), str(trial / "faulty")])
         assert "ride4: alarms beyond its noise" in str(error.value)
 
     def test_no_such_run(self, trial: Path, tmp_path: Path) -> None:
         with pytest.raises(UsageError, match="no such run"):
-            calibrated(plan_of(trial, tmp_path, "runs"), [str(trial / "nowhere")])
+            calibrate_plan(plan_of(trial, tmp_path, "runs"), [str(trial / "nowhere")])
 
 
 @pytest.mark.usefixtures("in_process", "remembered")

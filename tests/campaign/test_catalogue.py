@@ -54,15 +54,15 @@ def test_one_damaged_byte_means_not_there(tmp_path: Path, entry: str) -> None:
     catalogue.keep(out, entry, "key", b"content")
     content = file.read_bytes()
     key = content.split(b"\n")[1].decode()
-    assert catalogue.kept(out, entry, key) is not None
+    assert catalogue.kept_content(out, entry, key) is not None
     for at in range(0, len(content), max(1, len(content) // 97)):
         damaged = bytearray(content)
         damaged[at] ^= 0x10
         file.write_bytes(damaged)
-        assert catalogue.kept(out, entry, key) is None
+        assert catalogue.kept_content(out, entry, key) is None
     file.unlink()
     file.mkdir()
-    assert catalogue.kept(out, entry, key) is None
+    assert catalogue.kept_content(out, entry, key) is None
 
 
 def test_weak_tags_are_no_version() -> None:

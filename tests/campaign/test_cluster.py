@@ -12,8 +12,8 @@ from typing import Never
 import pytest
 
 from pipeline.campaign import RunOutcome, run_campaign
-from pipeline.campaign.cluster import lost_scheduler, replay_there
-from pipeline.campaign.outcome import lost, overdue
+from pipeline.campaign.cluster import lost_scheduler_error, replay_on_cluster
+from pipeline.campaign.outcome import lost_text, overdue_text
 from pipeline.campaign.plan import RunJob
 from pipeline.campaign.waits import WAITS
 from pipeline.results import store
@@ -74,7 +74,7 @@ def test_whatever_becomes_of_other_runs_the_bytes_are_the_same(
     def kill(run_id: str, age_s: float) -> None:
         if run_id not in deaths or age_s < _BEGUN_S or (run_id == "unlucky" and deaths[run_id]):
             return
-        if len(deaths[run_id]) > [lost for lost, _ in spy.losses].count(run_id):
+        if len(deaths[run_id]) > [lost_text for lost_text, _ in spy.losses].count(run_id):
             return
         pids = cluster.worker_pids
         deaths[run_id].append(pids[0])
@@ -90,7 +90,7 @@ def test_whatever_becomes_of_other_runs_the_bytes_are_the_same(
         name: 2 if name == "deadly" else 1 for name in dying
     }
     if "deadly" in dying:
-        assert outcomes["deadly"].error == lost(2)
+        assert outcomes["deadly"].error == lost_text(2)
         assert store.completed_runs(tmp_path / "out")["deadly"]["redo"] == "yes"
     assert outcomes["unlucky"].attempts == 2
     assert outcomes["bad"].status is RunStatus.FAILED
@@ -112,7 +112,7 @@ def test_scheduler_that_is_not_there(small_trial: SmallTrial, tmp_path: Path, mo
     monkeypatch.setattr(WAITS, "scheduler_s", 1.0)
     with pytest.raises(UsageError, match="Dask scheduler does not answer"):
         run_campaign(plan_of(small_trial, tmp_path), scheduler="tcp://127.0.0.1:9")
-    assert str(lost_scheduler("tls://KEY:sec/ret@host:9")).startswith("tls://host:9: the Dask scheduler")
+    assert str(lost_scheduler_error("tls://KEY:sec/ret@host:9")).startswith("tls://host:9: the Dask scheduler")
 
 
 class Parcel(RunOutcome):
@@ -123,7 +123,7 @@ class Parcel(RunOutcome):
 
 
 def replayed_and_lost(job: RunJob, limit_s: float) -> RunOutcome:
-    outcome, first = replay_there(job, limit_s), Path(job.out, "first")
+    outcome, first = replay_on_cluster(job, limit_s), Path(job.out, "first")
     if first.exists():
         return outcome
     first.touch()
@@ -134,7 +134,7 @@ def test_worker_that_dies_with_the_outcome_of_its_run(
     small_trial: SmallTrial, undisturbed: Path, cluster: Cluster, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The run is complete then, but nobody was told; Dask alone would begin it again, and never say how that ended."""
-    monkeypatch.setattr("pipeline.campaign.cluster.replay_there", replayed_and_lost)
+    monkeypatch.setattr("pipeline.campaign.cluster.replay_on_cluster", replayed_and_lost)
     spy = Spy(lambda *_: None)
     plan = plan_of(small_trial, tmp_path, small_trial.paths[:1])
     outcome = by_run(run_campaign(plan, scheduler=cluster.address, watches=[spy]))["run0"]
@@ -188,7 +188,7 @@ def test_hanging_worker_is_given_up(
 
     plan = plan_of(small_trial, tmp_path / "out", [tmp_path / "hanging.mcap", *small_trial.paths[:2]])
     outcomes = by_run(run_campaign(plan, scheduler=cluster.address, time_limit_s=_LIMIT_S, watches=[Spy(stop)]))
-    assert outcomes["hanging"].error == overdue(_LIMIT_S)
+    assert outcomes["hanging"].error == overdue_text(_LIMIT_S)
     assert outcomes["hanging"].attempts == 1
     assert [outcomes[f"run{number}"].status for number in range(2)] == [RunStatus.OK] * 2
 

@@ -151,7 +151,7 @@ def test_run_in_a_dead_store_is_given_up(ill: str, small_trial: SmallTrial, tmp_
     outcomes = by_run(summary)
     assert outcomes["far"].status is RunStatus.FAILED
     assert "far.mcap: the store gave no usable answer for 0.5 s: " in (outcomes["far"].error or "")
-    assert outcomes["far"].defect is False
+    assert outcomes["far"].is_defect is False
     assert outcomes["run0"].status is RunStatus.OK
 
 

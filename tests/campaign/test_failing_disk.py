@@ -51,7 +51,7 @@ def campaign(
     def at_hand(job: RunJob, *_: object) -> RunTables:
         return tables[job.run_id]
 
-    monkeypatch.setattr(worker, "_replayed", at_hand)
+    monkeypatch.setattr(worker, "_replay", at_hand)
     monkeypatch.setattr("pipeline.campaign.run.LocalEngine", lambda jobs: _engine())
     plan = plan_of(small_trial, tmp_path / "disk/out", small_trial.paths[:_RUNS])
     return lambda: run_campaign(plan)

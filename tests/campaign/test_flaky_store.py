@@ -68,7 +68,7 @@ def test_a_run_whose_object_fails_for_a_while(
     plan = make_plan([f"{BUCKET}/runs/run0"], small_trial.site, tmp_path)
     Flaky.ailment, Flaky.sick = ailment, "odometer.parquet"
     (sick,) = run_campaign(plan).outcomes
-    assert (sick.status, sick.defect) == (RunStatus.FAILED, False)
+    assert (sick.status, sick.is_defect) == (RunStatus.FAILED, False)
     assert store.completed_runs(tmp_path)["run0"]["redo"] == "yes"
     Flaky.well()
     (well,) = run_campaign(plan).outcomes

@@ -19,7 +19,7 @@ from benchmarks.growth import interruptions
 from benchmarks.growth.interruptions import Job, Victim, disturb
 from pipeline import storage
 from pipeline.campaign import Interrupted, make_plan, run_campaign
-from pipeline.campaign.lock import locked
+from pipeline.campaign.lock import hold_output
 from pipeline.campaign.worker import replay_one
 from pipeline.results import store
 from pipeline.storage.address import Address
@@ -62,7 +62,7 @@ def test_stop_on_request(small_trial: SmallTrial, undisturbed: Path, tmp_path: P
     assert 2 <= len(done) <= 4
     whole = result_bytes(undisturbed)
     assert all(whole[name] == data for name, data in result_bytes(out).items())
-    assert run_campaign(plan_of(small_trial, out)).skipped == len(done)
+    assert run_campaign(plan_of(small_trial, out)).count_skipped == len(done)
     assert result_bytes(out) == whole
     assert campaign_bytes(out) == campaign_bytes(undisturbed)
 
@@ -114,7 +114,7 @@ def test_stop_on_request_at_the_very_end(
     assert caught.value.summary is not None
     assert caught.value.summary.count(RunStatus.OK) == 1
     assert not (tmp_path / "campaign").exists()
-    assert run_campaign(plan).skipped == 1
+    assert run_campaign(plan).count_skipped == 1
     assert (tmp_path / "campaign/runs.parquet").exists()
 
 
@@ -146,7 +146,7 @@ def test_a_campaign_that_has_ended_writes_no_more(small_trial: SmallTrial, tmp_p
     orphan = replace(plan.jobs[0], campaign="lost")
     with pytest.raises(OutputError, match="no longer held by this campaign"):
         replay_one(orphan)
-    with locked(tmp_path), pytest.raises(OutputError, match="no longer held by this campaign"):
+    with hold_output(tmp_path), pytest.raises(OutputError, match="no longer held by this campaign"):
         replay_one(orphan)
     assert result_bytes(tmp_path) == before
 
@@ -219,7 +219,7 @@ def test_full_disk(
         whole = result_bytes(undisturbed)
         assert all(whole[name] == data for name, data in result_bytes(out).items() if ".tmp" not in name)
         subprocess.run(["mount", "-o", "remount,size=64m", str(disk)], check=True)
-        assert run_campaign(plan_of(small_trial, out)).skipped == len(complete)
+        assert run_campaign(plan_of(small_trial, out)).count_skipped == len(complete)
         assert result_bytes(out) == whole
 
 

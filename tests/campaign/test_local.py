@@ -18,7 +18,7 @@ import pytest
 from datasets.mcap_log import write_mcap
 from pipeline import storage
 from pipeline.campaign import CampaignSummary, RunOutcome, make_plan, recorded_log, run_campaign
-from pipeline.campaign.outcome import lost, never_begun
+from pipeline.campaign.outcome import lost_text, never_begun_text
 from pipeline.campaign.plan import _kept_sites
 from pipeline.campaign.waits import WAITS
 from pipeline.read.ingest import read_run
@@ -97,7 +97,7 @@ def test_a_log_is_known_by_what_its_files_hold(small_trial: SmallTrial, tmp_path
         run_campaign(plan, force=True)
         known = store.completed_runs(tmp_path / "out")[path.stem]["files_digest"]
         assert known == storage.digest_of_files(storage.file_digests(path))
-        assert run_campaign(plan).skipped == 1
+        assert run_campaign(plan).count_skipped == 1
 
 
 @pytest.mark.usefixtures("in_process")
@@ -124,7 +124,7 @@ def test_complete_runs_are_skipped(small_trial: SmallTrial, tmp_path: Path) -> N
     first = run_campaign(plan_of(small_trial, out, [run]))
     again = run_campaign(plan_of(small_trial, out, [run]))
     forced = run_campaign(plan_of(small_trial, out, [run]), force=True)
-    assert [summary.skipped for summary in (first, again, forced)] == [0, 1, 0]
+    assert [summary.count_skipped for summary in (first, again, forced)] == [0, 1, 0]
     assert [summary.count(RunStatus.OK) for summary in (first, again, forced)] == [1, 1, 1]
 
 
@@ -142,7 +142,7 @@ def test_what_changed_is_replayed_again(small_trial: SmallTrial, tmp_path: Path)
     shutil.copytree(small_trial.site, site)
 
     def skipped(config: Configuration | None = None) -> int:
-        return run_campaign(make_plan([str(run)], site, out, config)).skipped
+        return run_campaign(make_plan([str(run)], site, out, config)).count_skipped
 
     assert skipped() == 0
     stat = (run / "odometer.parquet").stat()
@@ -164,7 +164,7 @@ def test_clock_and_file_times_decide_nothing(
     monkeypatch.setattr("time.time", lambda: float(next(ticks)))
     assert run_campaign(plan_of(small_trial, out, [run])).count(RunStatus.OK) == 1
     os.utime(run / "gnss.parquet", (0, 0))
-    assert run_campaign(plan_of(small_trial, out, [run])).skipped == 1
+    assert run_campaign(plan_of(small_trial, out, [run])).count_skipped == 1
 
 
 def test_log_that_changes_while_it_is_read(
@@ -204,7 +204,7 @@ def test_a_panic_fails_its_run_only(small_trial: SmallTrial, tmp_path: Path, mon
     plans = [plan_of(small_trial, tmp_path, [path]) for path in small_trial.paths[:3]]
     outcomes = [run_campaign(plan).outcomes[0] for plan in plans]
     assert [outcome.status for outcome in outcomes] == [RunStatus.OK, RunStatus.FAILED, RunStatus.FAILED]
-    assert [outcome.defect for outcome in outcomes] == [False, False, True]
+    assert [outcome.is_defect for outcome in outcomes] == [False, False, True]
     assert re.search("run1: cannot be decoded, it is damaged: range end", outcomes[1].error or "")
     assert store.run_ids(tmp_path) == ["run0", "run1", "run2"]
 
@@ -217,7 +217,7 @@ def test_our_own_defect_is_told_apart(small_trial: SmallTrial, tmp_path: Path, m
     with monkeypatch.context() as patched:
         patched.setattr(importlib.import_module("pipeline.one_run"), "replay", broken)
         outcome = by_run(run_campaign(plan))["run0"]
-    assert outcome.defect
+    assert outcome.is_defect
     assert "ZeroDivisionError" in (outcome.trace or "")
     assert by_run(run_campaign(plan))["run0"].status is RunStatus.OK
 
@@ -289,7 +289,7 @@ def test_workers_that_never_start_fail_their_runs(
     plan = plan_of(small_trial, tmp_path, small_trial.paths[:2])
     monkeypatch.setattr(SpawnProcess, "start", start)
     summary = run_campaign(plan, jobs=2)
-    assert [outcome.error for outcome in summary.outcomes] == [never_begun(WAITS.starts)] * 2
+    assert [outcome.error for outcome in summary.outcomes] == [never_begun_text(WAITS.starts)] * 2
     assert run_campaign(plan).count(RunStatus.FAILED) == 2
 
 
@@ -307,7 +307,7 @@ def test_run_whose_worker_always_dies_is_reported(small_trial: SmallTrial, tmp_p
     plan = plan_of(small_trial, tmp_path / "out", [tmp_path / "deadly.mcap", *small_trial.paths[:1]])
     summary = by_run(run_campaign(plan, jobs=1, watches=[Spy(kill_it)]))
     assert summary["deadly"].status is RunStatus.FAILED
-    assert summary["deadly"].error == lost(2)
+    assert summary["deadly"].error == lost_text(2)
     assert summary["run0"].status is RunStatus.OK
     assert len(deaths) >= 2
     assert store.completed_runs(tmp_path / "out")["deadly"]["redo"] == "yes"
@@ -334,15 +334,15 @@ def test_single_run_is_given_up_too(tmp_path: Path, small_trial: SmallTrial) -> 
     endless(tmp_path / "hanging.mcap")
     plan = plan_of(small_trial, tmp_path / "out", [tmp_path / "hanging.mcap"])
     outcome = by_run(run_campaign(plan, time_limit_s=0.5))["hanging"]
-    assert (outcome.status, outcome.defect) == (RunStatus.FAILED, False)
+    assert (outcome.status, outcome.is_defect) == (RunStatus.FAILED, False)
     assert "time limit of 0.5 s" in (outcome.error or "")
 
 
 def test_output_held_by_another_campaign(small_trial: SmallTrial, tmp_path: Path) -> None:
-    from pipeline.campaign.lock import locked
+    from pipeline.campaign.lock import hold_output
 
     plan = plan_of(small_trial, tmp_path, small_trial.paths[:1])
-    with locked(tmp_path), pytest.raises(OutputError, match="another campaign is writing here"):
+    with hold_output(tmp_path), pytest.raises(OutputError, match="another campaign is writing here"):
         run_campaign(plan)
     assert run_campaign(plan).count(RunStatus.OK) == 1
 

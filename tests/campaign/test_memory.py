@@ -15,7 +15,7 @@ import polars as pl
 import pytest
 
 from pipeline.campaign import CampaignSummary, RunOutcome, run_campaign
-from pipeline.campaign.outcome import NO_MEMORY, failure_of, lost
+from pipeline.campaign.outcome import NO_MEMORY, failure_of, lost_text
 from pipeline.storage.parquet import parquet_bytes
 from schemas.enums import RunStatus
 from tests.campaign.compare import plan_of
@@ -63,7 +63,7 @@ def test_a_run_without_memory_fails_and_the_campaign_goes_on(tmp_path: Path, sma
     outcomes = {outcome.run_id: outcome for outcome in summary.outcomes}
     failed = outcomes.pop("large")
     assert failed.status is RunStatus.FAILED
-    assert failed.error == lost(2)
+    assert failed.error == lost_text(2)
     assert {outcome.status for outcome in outcomes.values()} == {RunStatus.OK}
     assert len(outcomes) == len(small_trial.paths)
 

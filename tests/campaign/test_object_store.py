@@ -14,7 +14,7 @@ from werkzeug.serving import BaseWSGIServer, make_server
 
 from pipeline import storage
 from pipeline.campaign import lock, make_plan, run_campaign
-from pipeline.campaign.lock import locked
+from pipeline.campaign.lock import hold_output
 from pipeline.campaign.verify import verify
 from pipeline.campaign.waits import WAITS
 from pipeline.results import store
@@ -119,7 +119,7 @@ def test_same_bytes_as_on_disk(bucket: str, undisturbed: Path, tmp_path: Path, r
     assert run_campaign(plan, jobs=1).count(RunStatus.OK) == 2
     assert remote_bytes(f"{bucket}/out") == of_two(result_bytes(undisturbed))
     again = run_campaign(plan, jobs=1)
-    assert (again.skipped, again.count(RunStatus.OK)) == (2, 2)
+    assert (again.count_skipped, again.count(RunStatus.OK)) == (2, 2)
     request.getfixturevalue("in_process")
     local = run_campaign(make_plan([f"{bucket}/runs/run0", f"{bucket}/runs/run1"], f"{bucket}/site", tmp_path))
     assert local.count(RunStatus.OK) == 2
@@ -195,7 +195,7 @@ def test_log_that_cannot_be_had_now_is_tried_again(
     assert (first.count(RunStatus.OK), first.count(RunStatus.FAILED)) == (1, 1)
     assert "the store refused" in (by_run(first)["run2"].error or "")
     again = run_campaign(plan)
-    assert (again.count(RunStatus.OK), again.skipped) == (2, 1)
+    assert (again.count(RunStatus.OK), again.count_skipped) == (2, 1)
 
 
 @pytest.mark.usefixtures("in_process")
@@ -204,10 +204,10 @@ def test_logs_are_not_fetched_again(s3: Moody, bucket: str, tmp_path: Path) -> N
     run_campaign(plan)
     assert any("/runs/run1/" in place for place in s3.fetched)
     s3.fetched.clear()
-    assert run_campaign(plan).skipped == 2
+    assert run_campaign(plan).count_skipped == 2
     assert [place for place in s3.fetched if "/runs/" in place] == []
     shutil.rmtree(tmp_path / ".catalogue")
-    assert run_campaign(plan).skipped == 2
+    assert run_campaign(plan).count_skipped == 2
     assert any("/runs/run1/" in place for place in s3.fetched)
 
 
@@ -218,12 +218,12 @@ def test_changed_log_in_a_store_is_replayed_again(bucket: str, small_trial: Smal
     remote = s3fs.S3FileSystem(use_listings_cache=False)
     remote.put(f"{small_trial.paths[0]}/", "trials/changing/run0/", recursive=True)
     plan = make_plan([f"{bucket}/changing/run0"], small_trial.site, tmp_path)
-    assert [run_campaign(plan).skipped for _ in range(2)] == [0, 1]
+    assert [run_campaign(plan).count_skipped for _ in range(2)] == [0, 1]
     place = "trials/changing/run0/odometer.parquet"
     content = bytearray(remote.cat(place))
     content[content.index(b"ARROW:schema")] ^= 1
     remote.pipe(place, bytes(content))
-    assert [run_campaign(plan).skipped for _ in range(2)] == [0, 1]
+    assert [run_campaign(plan).count_skipped for _ in range(2)] == [0, 1]
 
 
 def test_log_that_changes_while_it_is_fetched(
@@ -256,21 +256,21 @@ def _quick_beat(monkeypatch: pytest.MonkeyPatch) -> None:
 @pytest.mark.usefixtures("_quick_beat")
 def test_one_campaign_at_a_time(bucket: str) -> None:
     out = f"{bucket}/held"
-    with locked(out), pytest.raises(OutputError, match="another campaign is writing here"), locked(out):
+    with hold_output(out), pytest.raises(OutputError, match="another campaign is writing here"), hold_output(out):
         pass
-    with locked(out):
+    with hold_output(out):
         pass
 
 
 @pytest.mark.usefixtures("_quick_beat")
 def test_lock_that_was_taken_over_is_left_alone(bucket: str) -> None:
     place = f"{bucket}/taken/.lock"
-    with locked(f"{bucket}/taken") as own:
+    with hold_output(f"{bucket}/taken") as own:
         lock.check_held(f"{bucket}/taken", own)
         storage.write_bytes(place, b"another 0")
         with pytest.raises(OutputError, match="no longer held"):
             lock.check_held(f"{bucket}/taken", own)
-        wait_for(lambda: not any(getattr(one, "_target", None) is lock._beat for one in threading.enumerate()))
+        wait_for(lambda: not any(getattr(one, "_target", None) is lock._renew_lock for one in threading.enumerate()))
     assert storage.read_many([place]) == {place: b"another 0"}
 
 
@@ -278,6 +278,6 @@ def test_lock_that_was_taken_over_is_left_alone(bucket: str) -> None:
 def test_lock_of_a_dead_campaign_is_taken_over(bucket: str, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(WAITS, "lock_silence_s", 1.0)
     storage.write_bytes(f"{bucket}/dead/.lock", b"somebody 7")
-    with locked(f"{bucket}/dead"):
+    with hold_output(f"{bucket}/dead"):
         assert b"somebody" not in storage.read_many([f"{bucket}/dead/.lock"])[f"{bucket}/dead/.lock"]
     assert storage.read_many([f"{bucket}/dead/.lock"]) == {}

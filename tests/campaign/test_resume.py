@@ -30,7 +30,7 @@ def settled(
     monkeypatch.setattr(WAITS, "settled_s", 0.0)
     trial = SmallTrial(small_trial.site, tmp_path / "runs")
     shutil.copytree(small_trial.paths[0], trial.runs / "run0")
-    assert run_campaign(plan_of(trial, tmp_path / "out")).skipped == 0
+    assert run_campaign(plan_of(trial, tmp_path / "out")).count_skipped == 0
     return trial, tmp_path / "out"
 
 
@@ -74,9 +74,9 @@ def test_whatever_changed_is_looked_into(settled: tuple[SmallTrial, Path], chang
         case "damaged":
             (out / ".catalogue/complete").write_text("[{}")
     plan = make_plan([str(trial.runs)], trial.site, out, config)
-    assert resume.unchanged(plan) == []
-    assert run_campaign(plan).skipped == (change in ("catalogue", "damaged"))
-    assert len(resume.unchanged(plan)) == 1
+    assert resume.unchanged_outcomes(plan) == []
+    assert run_campaign(plan).count_skipped == (change in ("catalogue", "damaged"))
+    assert len(resume.unchanged_outcomes(plan)) == 1
 
 
 def test_a_log_that_was_just_written_is_read_again(
@@ -86,7 +86,7 @@ def test_a_log_that_was_just_written_is_read_again(
     trial, out = settled
     monkeypatch.setattr(WAITS, "settled_s", 3600.0)
     run_campaign(plan_of(trial, out), force=True)
-    assert resume.unchanged(plan_of(trial, out)) == []
+    assert resume.unchanged_outcomes(plan_of(trial, out)) == []
 
 
 def test_what_the_disk_did_not_give_is_no_failure_of_the_log() -> None:
@@ -112,11 +112,11 @@ def test_packed_runs_are_known_and_new_ones_replayed(
         (known,) = run_campaign(plan_of(trial, out)).outcomes
     assert replace(known, proof="") == replace(before, proof="")
     shutil.copytree(small_trial.paths[1], trial.runs / "run1")
-    assert run_campaign(plan_of(trial, out)).skipped == 1
+    assert run_campaign(plan_of(trial, out)).count_skipped == 1
     assert (store.run_ids(out), store.own_runs(out)) == (["run0", "run1"], ["run1"])
     shutil.rmtree(out / ".catalogue")
-    assert run_campaign(plan_of(trial, out)).skipped == 2
+    assert run_campaign(plan_of(trial, out)).count_skipped == 2
     assert verify(out).problems == ()
-    assert run_campaign(plan_of(trial, out), force=True).skipped == 0
+    assert run_campaign(plan_of(trial, out), force=True).count_skipped == 0
     assert compact(out).packed == 2
     assert verify(out).problems == ()

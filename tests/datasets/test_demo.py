@@ -14,7 +14,7 @@ from datasets.comparison import checks_table, compare, describe_faults
 from datasets.demo import DemoResult, demo, demo_scenario
 from datasets.trial import build_run, build_site
 from pipeline import replay
-from pipeline.campaign.verify import recompute, verify
+from pipeline.campaign.verify import verify, verify_by_replay
 from pipeline.show.terminal import table_lines, to_json
 from schemas.config import Vehicle, load_settings
 from schemas.run import RunTables
@@ -37,7 +37,7 @@ def test_the_demo_verifies(result: DemoResult) -> None:
     assert verify(tables).problems == ()
     vehicle = load_settings(folder / "vehicle.toml", Vehicle)
     logs = [str(folder / "runs" / run) for run in ("clean.mcap", "odometer_scale")]
-    again = recompute(tables, logs, folder / "site", None, vehicle)
+    again = verify_by_replay(tables, logs, folder / "site", None, vehicle)
     assert (again.problems, again.compared) == ((), f"2 of {len(result.tables)} runs replayed again")
 
 

@@ -102,7 +102,7 @@ RULE = [
     (WORDS, 'nothing_accepted = "no VB was accepted"', 'wide_in_use = "in use with +- {confidence_max_m:.1f} m"\n'),
     (
         FIGURES,
-        '        "unknown_in_use_s": _longest_s(',
+        '        "unknown_in_use_s": _longest_stretch_s(',
         '        "confidence_max_m": float(epochs.confidence_m[used_s > 0.0].max(initial=0.0)),\n',
     ),
     (
@@ -141,14 +141,14 @@ EVIDENCE = [
     ),
     (
         ANCHORS,
-        "def on_clock(",
+        "def put_on_clock(",
         "def detector_anchors(\n"
         "    passed: pl.DataFrame | None, track: SurveyedTrack, config: HazardConfig\n"
         ") -> list[TrueAnchor]:\n"
         '    """Passages at trackside detectors that lie on the survey, in order of time."""\n'
         "    if passed is None:\n"
         "        return []\n"
-        "    rows, elements = track.holding(passed)\n"
+        "    rows, elements = track.elements_holding(passed)\n"
         '    known = passed[rows].with_columns(element=elements).sort("t")\n'
         '    places = zip(times_ns(known).tolist(), known["element"], known["measure_m"], strict=True)\n'
         "    return [\n"

@@ -48,14 +48,14 @@ def small_result(folder: Path) -> Path:
 
 def cache_case(whole: Path) -> Case:
     """A file of `.catalogue` changed."""
-    expected = resume.kept(str(whole))
+    expected = resume.kept_outcomes(str(whole))
 
     def case(random: Random, folder: Path) -> str:
         out = _copy(whole, folder)
         files = sorted(file for file in (out / ".catalogue").rglob("*") if file.is_file())
         chosen = files[random.integers(len(files))]
         chosen.write_bytes(mutated(chosen.read_bytes(), random))
-        return "whole" if resume.kept(str(out)) in ({}, expected) else "WRONG another answer"
+        return "whole" if resume.kept_outcomes(str(out)) in ({}, expected) else "WRONG another answer"
 
     return case
 

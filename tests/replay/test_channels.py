@@ -12,7 +12,7 @@ from pipeline.show.report import write_report
 from pipeline.stages.monitors.single import on_path_of, paired
 from pipeline.studies.safety.assessment import assess
 from pipeline.studies.safety.side_by_side import side_by_side
-from pipeline.studies.safety.tally import COMPOSITE, REACTIVE, added, architecture_figures
+from pipeline.studies.safety.tally import COMPOSITE, REACTIVE, add_counts, architecture_figures
 from schemas.config import Configuration, LdsConfig
 from schemas.errors import InputError
 from tests.replay.journeys import VEHICLE, journey, replay
@@ -42,7 +42,7 @@ def two(first, second):
 def rows(tables, config=None):
     settings = config or Configuration()
     found = side_by_side(tables.epochs, tables.hazards, tables.alarms, tables.runs, settings)
-    figures = architecture_figures(added([found]))
+    figures = architecture_figures(add_counts([found]))
     return {(row["solution"], row["architecture"]): row for row in figures.iter_rows(named=True)}
 
 

@@ -19,7 +19,7 @@ from pipeline.one_run import replay
 from pipeline.results.store import write_run
 from pipeline.show.inspection import inspect_result
 from pipeline.studies.line.passes import PieceIndex, passes_of
-from pipeline.studies.line.pieces import middles, pieces_of
+from pipeline.studies.line.pieces import middles_in_plane_m, pieces_of
 from pipeline.studies.safety.assessment import assess
 from schemas import words
 from schemas.config import Configuration, Vehicle, settings_from
@@ -56,7 +56,7 @@ def tables_of(out: Path) -> dict[str, pl.DataFrame]:
     found = replay(build_run(scenario, scenario.runs[0]), site, VEHICLE, config)
     write_run(found, out, {})
     pieces = pieces_of(site, LineCriteria().piece_m)
-    ground = PieceIndex.of(site, pieces, middles(site, pieces))
+    ground = PieceIndex.of_pieces(site, pieces, middles_in_plane_m(site, pieces))
     passes = passes_of(found.epochs, found.passages, found.alarms, ground, LineCriteria(), config)
     tables = {name: getattr(found, name) for name in ("hazards", "passages", "alarms", "epochs")}
     assessed = assess(str(out))

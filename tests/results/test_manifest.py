@@ -15,7 +15,7 @@ import pytest
 
 from pipeline.campaign import make_plan, run_campaign
 from pipeline.campaign.run import write_campaign
-from pipeline.campaign.verify import recompute, verify
+from pipeline.campaign.verify import verify, verify_by_replay
 from pipeline.results.manifest import note_pages, settings_files
 from pipeline.results.store import table_address
 from pipeline.show.report import write_report
@@ -170,7 +170,7 @@ def test_a_marker_that_was_changed_is_no_complete_run(out: Path, small_trial: Sm
     rewritten(marker, "unsafe")
     assert pl.read_parquet_metadata(marker).items() >= {("balise.run_id", "run0")}
     summary = run_campaign(make_plan([str(small_trial.paths[0])], small_trial.site, copy))
-    assert (summary.skipped, marker.read_bytes() == before) == (0, True)
+    assert (summary.count_skipped, marker.read_bytes() == before) == (0, True)
     assert verify(copy).problems == ()
 
 
@@ -183,7 +183,7 @@ def test_a_run_is_not_complete_without_the_tables_that_it_was_written_with(
     before = file.read_bytes()
     shutil.copyfile(table_address(copy, table, "bad"), file)
     summary = run_campaign(make_plan([str(small_trial.paths[0])], small_trial.site, copy))
-    assert (summary.skipped, file.read_bytes() == before) == (0, True)
+    assert (summary.count_skipped, file.read_bytes() == before) == (0, True)
     assert verify(copy).problems == ()
 
 
@@ -221,7 +221,7 @@ def test_a_manifest_of_any_content_stops_nothing(out: Path, tmp_path: Path, cont
 @pytest.mark.usefixtures("forked_workers")
 def test_a_run_made_without_vehicle_file_is_replayed_without(out: Path, small_trial: SmallTrial, train: Path) -> None:
     logs = [str(path) for path in small_trial.paths[:2]]
-    again = recompute(out, logs, small_trial.site, None, load_settings(train, Vehicle))
+    again = verify_by_replay(out, logs, small_trial.site, None, load_settings(train, Vehicle))
     assert (again.problems, again.compared) == ((), "2 of 3 runs replayed again")
 
 
@@ -246,11 +246,11 @@ def test_no_manifest_is_one_error(out: Path, tmp_path: Path) -> None:
 
 
 def test_logs_are_replayed_again_and_compared(out: Path, small_trial: SmallTrial, tmp_path: Path) -> None:
-    same = recompute(out, [str(small_trial.paths[0])], small_trial.site, None, Vehicle())
+    same = verify_by_replay(out, [str(small_trial.paths[0])], small_trial.site, None, Vehicle())
     assert (same.problems, same.compared) == ((), "1 of 3 runs replayed again")
     other = shutil.copytree(small_trial.paths[2], tmp_path / "run1")
-    wrong = recompute(out, [str(other)], small_trial.site, None, Vehicle())
+    wrong = verify_by_replay(out, [str(other)], small_trial.site, None, Vehicle())
     assert wrong.problems == (("settings of 1 run", "others", "--vehicle train7.toml"),)
     changed = shutil.copytree(small_trial.paths[2], tmp_path / "run0")
-    named = {what for what, _, _ in recompute(out, [str(changed)], small_trial.site, None, Vehicle()).problems}
+    named = {what for what, _, _ in verify_by_replay(out, [str(changed)], small_trial.site, None, Vehicle()).problems}
     assert {"run run0, log gnss.parquet", "run run0, epochs", "run run0, runs"} <= named

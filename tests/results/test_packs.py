@@ -83,8 +83,8 @@ def test_every_question_has_the_same_answer(out: Path, tmp_path: Path) -> None:
     assert (found.packed, found.packs, found.own, found.left_out) == (4, 2, 0, {})
     assert content(out) == before
     assert store.run_ids(out) == sorted(RUNS)
-    assert diff_results(tmp_path / "own", out).same
-    assert diff_results(out, tmp_path / "own").same
+    assert diff_results(tmp_path / "own", out).is_same
+    assert diff_results(out, tmp_path / "own").is_same
     asked = run_sql(out, "SELECT run_id, alarm_id FROM alarms WHERE run_id <> 'e' ORDER BY run_id, alarm_id")
     assert asked.rows() == [("a b", 0), ("a b", 1), ("f", 0)]
     assert run_sql(out, "SELECT run_id FROM runs WHERE run_id IN ('c/d', 'f') AND solution = 'second'").height == 2
@@ -133,7 +133,7 @@ def test_own_files_count_before_packs(out: Path) -> None:
         compact(out, runs_per_pack=3)
     # Whoever reads the files of packs alone finds each run once.
     assert pl.read_parquet(out / "alarms/compact/*.parquet").height == 11
-    assert sum(pack.runs for pack in packs.listed(out)) == 5
+    assert sum(pack.runs for pack in packs.read_list(out)) == 5
 
 
 def test_what_is_packed_stays_as_it_is(out: Path) -> None:
@@ -231,7 +231,7 @@ def test_damage_is_an_error(out: Path, place: str) -> None:
     compact(out)
     # What a pack holds is remembered by its place.
     out = shutil.copytree(out, out.with_name("copy"))
-    (pack,) = packs.listed(out)
+    (pack,) = packs.read_list(out)
     file = {"list": packs.LIST, "index": f"compact/{pack.name}.parquet", "table": f"runs/compact/{pack.name}.parquet"}
     data = bytearray((out / file[place]).read_bytes())
     data[len(data) // 3] ^= 0xFF
@@ -242,7 +242,7 @@ def test_damage_is_an_error(out: Path, place: str) -> None:
 
 def with_other_values(out: Path) -> Path:
     """The table `runs` of the first pack with a value changed by somebody who can write Parquet."""
-    file = out / f"runs/compact/{packs.listed(out)[0].name}.parquet"
+    file = out / f"runs/compact/{packs.read_list(out)[0].name}.parquet"
     table = pq.read_table(file)
     at = table.column_names.index("availability")
     field = table.schema.field(at)
@@ -293,7 +293,7 @@ def test_a_changed_pack_is_not_packed_again(out: Path) -> None:
     store.write_run(with_alarms("g", 1), out, METADATA)
     with pytest.raises(UsageError, match=r"runs/compact/.*not the one that was packed"):
         compact(out)
-    list_anew(out, packs.listed(out)[0].sha256)
+    list_anew(out, packs.read_list(out)[0].sha256)
     with pytest.raises(UsageError, match="cannot be made again byte for byte"):
         compact(out)
 
@@ -313,7 +313,7 @@ def test_verify_holds_rows_of_packs_against_markers(
     assert verify(out).problems == ()
     out = shutil.copytree(out, out.with_name("copy"))
     file = with_other_values(out)
-    list_anew(out, packs.listed(out)[0].sha256 | {"runs": hashlib.sha256(file.read_bytes()).hexdigest()})
+    list_anew(out, packs.read_list(out)[0].sha256 | {"runs": hashlib.sha256(file.read_bytes()).hexdigest()})
     write_manifest(out)
     found = verify(out)
     assert {what for what, *_ in found.problems} == (
@@ -333,7 +333,7 @@ def test_verify_sees_own_files_of_a_packed_run(out: Path) -> None:
 
 def test_a_list_that_names_no_table_cannot_be_read(out: Path) -> None:
     compact(out)
-    list_anew(out, {"index": packs.listed(out)[0].sha256["index"]})
+    list_anew(out, {"index": packs.read_list(out)[0].sha256["index"]})
     with pytest.raises(UsageError, match="not the digests of all files"):
         store.run_ids(out)
 
@@ -352,4 +352,4 @@ def test_in_an_object_store(out: Path) -> None:
     assert run_sql(address, "SELECT run_id FROM alarms WHERE run_id = 'c/d'").height == 4
     undo(address)
     assert json.loads(json.dumps(store.run_ids(address))) == sorted(RUNS)
-    assert packs.listed(address) == []
+    assert packs.read_list(address) == []

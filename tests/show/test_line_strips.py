@@ -24,7 +24,7 @@ def test_an_element_against_the_line_is_counted_backwards() -> None:
     (line,) = lines_of({"B": 500.0, "A": 1000.0}, links(("A", 1, "B", 1)))
     first, second = line
     assert [(part.name, part.reversed, part.begin_m) for part in line] == [("B", False, 0.0), ("A", True, 500.0)]
-    assert (first.at(100.0), second.at(100.0)) == (100.0, 1400.0)
+    assert (first.distance_on_line_m(100.0), second.distance_on_line_m(100.0)) == (100.0, 1400.0)
 
 
 def test_a_branch_is_a_line_of_its_own() -> None:

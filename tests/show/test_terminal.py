@@ -5,7 +5,7 @@ from __future__ import annotations
 import polars as pl
 import pytest
 
-from pipeline.show.progress import as_fits
+from pipeline.show.progress import join_fitting
 from pipeline.show.terminal import table_lines
 
 WIDE = pl.DataFrame({f"column_{number}": [number * 1000.0 + row for row in range(9)] for number in range(30)})
@@ -86,7 +86,7 @@ def test_a_word_longer_than_the_line_breaks_behind_its_signs() -> None:
     ("room", "fitting"), [(10, "2 failed or partial"), (44, "2 failed or partial, 5 min 3 s left")]
 )
 def test_progress_says_what_fits(room: int, fitting: str) -> None:
-    assert as_fits(["2 failed or partial", "5 min 3 s left", "1.32 runs/s"], room) == fitting
+    assert join_fitting(["2 failed or partial", "5 min 3 s left", "1.32 runs/s"], room) == fitting
 
 
 def test_in_a_pipe_nothing_is_left_out() -> None:

@@ -34,7 +34,7 @@ from pipeline.campaign import find_runs
 from pipeline.read.ingest import read_run
 from pipeline.read.site.read import read_site
 from pipeline.results.software import software_digest
-from pipeline.results.workers import mapped
+from pipeline.results.workers import map_in_processes
 from pipeline.show.terminal import duration_text
 from pipeline.storage.described import noted_bytes
 from pipeline.storage.parquet import parquet_bytes
@@ -153,7 +153,7 @@ def recorded_experiment(
     inputs = _inputs(runs, site, vehicle, config, solution, plan, banks_of(plan, plan_file, config))
     # An earlier call may have found other runs at these addresses.
     _KEPT.clear()
-    surveyed = _without_copies(mapped(_survey, [(inputs, run) for run in inputs.runs], jobs))
+    surveyed = _without_copies(map_in_processes(_survey, [(inputs, run) for run in inputs.runs], jobs))
     rooms = [one.room for one in surveyed if one.room is not None]
     if not rooms:
         raise next(one.error for one in surveyed if one.error is not None)
@@ -164,7 +164,9 @@ def recorded_experiment(
     onsets = numbered(cells, drawn)
     pieces = _pieces(inputs, onsets, digests, out)
     say(_estimate(onsets, pieces, surveyed, len(inputs.banks), jobs))
-    tables = _tables(mapped(_replay_piece, pieces, jobs), surveyed, cells, plan, [bank.name for bank in inputs.banks])
+    tables = _tables(
+        map_in_processes(_replay_piece, pieces, jobs), surveyed, cells, plan, [bank.name for bank in inputs.banks]
+    )
     files = _write(out, tables, plan)
     _remove_others(pieces, out)
     return ExperimentResult(tables, {one.run_id: str(one.error) for one in surveyed if one.error is not None}, files)

@@ -16,7 +16,7 @@ from datasets.experiment.recorded.plan import RecordedPlan
 from datasets.faults import FaultKind
 from pipeline.show.report.columns import frame_table
 from pipeline.show.report.markup import page, script_json, section
-from pipeline.show.svg_plot import COLOURS, Axis, Curve, Piece, plot, strips
+from pipeline.show.svg_plot import COLOURS, Axis, Curve, Piece, plot, strips_svg
 from schemas.enums import OwnError
 from schemas.experiment import ExperimentBanks, ExperimentCells, ExperimentPlaces, ExperimentRuns
 from schemas.version import SOFTWARE
@@ -117,7 +117,7 @@ def _line(title: str, places: pl.DataFrame) -> str:
         )
         piece = Piece(row["from_m"], row["to_m"], (row["unnoticed_max_m"], row["slowness"]), words)
         rows.setdefault(row["netelement_id"], []).append(piece)
-    return strips(title, rows, {"unnoticed [m]": UNNOTICED_M, "slowness": SLOWNESS})
+    return strips_svg(title, rows, {"unnoticed [m]": UNNOTICED_M, "slowness": SLOWNESS})
 
 
 def recorded_page(tables: Mapping[str, pl.DataFrame], drawn: Mapping[str, tuple[str, str]], plan: RecordedPlan) -> str:

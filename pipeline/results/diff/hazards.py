@@ -33,27 +33,27 @@ class HazardChange:
     differences: tuple[Difference, ...] = ()
 
     @property
-    def _deciding(self) -> list[str]:
+    def _deciding_differences(self) -> list[str]:
         """Differences in columns that decide about a hazard."""
         return [item.column for item in self.differences if item.column in _DECIDING]
 
     @property
-    def matters(self) -> bool:
-        """Whether it is more than other figures of the same hazard."""
-        return self.change != "changed" or bool(self._deciding)
+    def changes_decision(self) -> bool:
+        """Whether more differs than figures of the same hazard."""
+        return self.change != "changed" or bool(self._deciding_differences)
 
     @property
-    def _head(self) -> str:
+    def _title(self) -> str:
         """Which hazard it is, and how it changed, for people."""
         return f"{self.hazard} at {self.t_hazard} ({self.solution}) {self.change}"
 
     @property
-    def short(self) -> str:
+    def one_line(self) -> str:
         """The change in one line; of changed values the columns alone."""
-        return ": ".join(filter(None, [self._head, ", ".join(self._deciding)]))
+        return ": ".join(filter(None, [self._title, ", ".join(self._deciding_differences)]))
 
     def __str__(self) -> str:
-        return self._head + "".join(f"\n    {item.column}: {item.message}" for item in self.differences)
+        return self._title + "".join(f"\n    {item.column}: {item.message}" for item in self.differences)
 
 
 def compare_hazards(
@@ -74,9 +74,9 @@ def compare_hazards(
     schema = [item for item in compare_tables(a.clear(), b.clear(), Hazards, rules=rules) if item.kind == "schema"]
     if any(item.column in {"solution", "hazard", "t_hazard"} for item in schema):
         return schema, []
-    pairs = _matched(a, b)
-    changes = [_change("vanished", a, row) for row in range(a.height) if row not in pairs]
-    changes += [_change("appeared", b, row) for row in range(b.height) if row not in pairs.values()]
+    pairs = _match_rows(a, b)
+    changes = [_timed_change("vanished", a, row) for row in range(a.height) if row not in pairs]
+    changes += [_timed_change("appeared", b, row) for row in range(b.height) if row not in pairs.values()]
     ids = ["hazard_id", "caused_by"] if changes else []
     for row_a, row_b in pairs.items():
         rows = (
@@ -85,11 +85,11 @@ def compare_hazards(
         )
         differing = tuple(item for item in compare_tables(*rows, Hazards, rules=rules) if item.kind == "values")
         if differing:
-            changes.append(_change("changed", a, row_a, differing))
+            changes.append(_timed_change("changed", a, row_a, differing))
     return schema, [change for _, change in sorted(changes, key=lambda item: item[0])]
 
 
-def _matched(a: pl.DataFrame, b: pl.DataFrame) -> dict[int, int]:
+def _match_rows(a: pl.DataFrame, b: pl.DataFrame) -> dict[int, int]:
     """Rows of `a` to rows of `b`: each at most once, the nearest in time first."""
     rows_a, rows_b = (
         frame.select("solution", pl.col("hazard").cast(pl.String), t=pl.col("t_hazard").to_physical()).rows()
@@ -110,10 +110,10 @@ def _matched(a: pl.DataFrame, b: pl.DataFrame) -> dict[int, int]:
     return dict(sorted(pairs.items()))
 
 
-def _change(
+def _timed_change(
     change: Change, frame: pl.DataFrame, row: int, differences: tuple[Difference, ...] = ()
 ) -> tuple[int, HazardChange]:
-    """The change behind its time [ns]; hazards without one come first."""
+    """The time of a change [ns] and the change; hazards without a time come first."""
     t_text = frame["t_hazard"].dt.to_string("%Y-%m-%dT%H:%M:%S%.3fZ")[row] or "an unknown time"
     found = HazardChange(change, frame["solution"][row], str(frame["hazard"][row]), t_text, differences)
     return int(frame["t_hazard"].to_physical()[row] or 0), found

@@ -58,8 +58,8 @@ class RunDiff:
     made_otherwise: tuple[str, ...] = ()
 
     @property
-    def same(self) -> bool:
-        """Nothing differs."""
+    def is_same(self) -> bool:
+        """Whether nothing differs."""
         return not (self.hazards or self.differences)
 
     @property
@@ -86,19 +86,19 @@ class ResultDiff:
     notes: tuple[str, ...] = ()
 
     @property
-    def same(self) -> bool:
-        """The same runs, and nothing differs in any."""
+    def is_same(self) -> bool:
+        """Whether both results have the same runs, and nothing differs in any."""
         return not (self.only_in_a or self.only_in_b or self.runs)
 
     def text(self, detail: bool = False) -> str:
         """How much changed, for people; then verdicts, hazards and balises, in `detail` also every other value."""
         lines = [self._sentence(), *(f"note: {note}" for note in self.notes)]
         lines += [f"{run}: only in A" for run in self.only_in_a] + [f"{run}: only in B" for run in self.only_in_b]
-        lines += _section("Verdicts", [(run.run_id, text) for run in self.runs for text in run.verdicts], detail)
-        lines += _section("Hazards", self._hazards(), detail)
-        lines += _section("Balises", [(run.run_id, text) for run in self.runs for text in run.balises], detail)
+        lines += _section_lines("Verdicts", [(run.run_id, text) for run in self.runs for text in run.verdicts], detail)
+        lines += _section_lines("Hazards", self._hazard_lines(), detail)
+        lines += _section_lines("Balises", [(run.run_id, text) for run in self.runs for text in run.balises], detail)
         if not detail:
-            return "\n".join([*lines, *self._others()])
+            return "\n".join([*lines, *self._other_lines()])
         for run in self.runs:
             lines += ["", f"{run.run_id}:", *(f"  {finding}" for finding in run.findings)]
         return "\n".join(lines)
@@ -109,13 +109,13 @@ class ResultDiff:
         alone = [f"{len(runs)} only in {name}" for runs, name in ((self.only_in_a, "A"), (self.only_in_b, "B")) if runs]
         return ", ".join([f"{self.compared} runs in both: {verdict}", *alone])
 
-    def _hazards(self) -> list[tuple[str, str]]:
+    def _hazard_lines(self) -> list[tuple[str, str]]:
         """Hazards that came, went or were judged otherwise, and how many have other figures only."""
-        rows = [(run.run_id, item.short) for run in self.runs for item in run.hazards if item.matters]
-        figures = Counter(run.run_id for run in self.runs for item in run.hazards if not item.matters)
+        rows = [(run.run_id, item.one_line) for run in self.runs for item in run.hazards if item.changes_decision]
+        figures = Counter(run.run_id for run in self.runs for item in run.hazards if not item.changes_decision)
         return rows + [(run_id, f"{count} with other figures only") for run_id, count in figures.items()]
 
-    def _others(self) -> list[str]:
+    def _other_lines(self) -> list[str]:
         """What else changed, by column; the values are in the detail."""
         counts = Counter(column for run in self.runs for column in sorted(run.other_columns))
         if not counts:
@@ -126,7 +126,7 @@ class ResultDiff:
 
     def as_dict(self) -> dict[str, object]:
         """The difference for programs: plain values, as JSON holds them."""
-        return {"same": self.same, **asdict(self)}
+        return {"same": self.is_same, **asdict(self)}
 
 
 def diff_results(out_a: Address, out_b: Address, rules: Rules = NO_RULES) -> ResultDiff:
@@ -150,12 +150,12 @@ def diff_results(out_a: Address, out_b: Address, rules: Rules = NO_RULES) -> Res
         compared=len(common),
         only_in_a=tuple(run for run in runs_a if run not in set(runs_b)),
         only_in_b=tuple(run for run in runs_b if run not in set(runs_a)),
-        runs=tuple(run for run in diffs if not run.same),
+        runs=tuple(run for run in diffs if not run.is_same),
         notes=tuple(f"{column} differs in {others[column]} runs" for column in _PROVENANCE if others[column]),
     )
 
 
-def _section(title: str, rows: list[tuple[str, str]], detail: bool) -> list[str]:
+def _section_lines(title: str, rows: list[tuple[str, str]], detail: bool) -> list[str]:
     """A heading and one line per change, the run in front; not more than a screen without `detail`."""
     if not rows:
         return []
@@ -172,7 +172,7 @@ def _diff_run(out_a: Address, out_b: Address, run_id: str, rules: Rules) -> RunD
     verdicts: tuple[str, ...] = ()
     balises: tuple[str, ...] = ()
     for table, contract in TABLES.items():
-        if (pair := _unlike(out_a, out_b, table, run_id)) is None:
+        if (pair := _unlike_tables(out_a, out_b, table, run_id)) is None:
             continue
         if table == "hazards":
             differing, hazards = compare_hazards(*pair, rules)
@@ -191,13 +191,13 @@ def _diff_run(out_a: Address, out_b: Address, run_id: str, rules: Rules) -> RunD
     return RunDiff(run_id, verdicts, balises, tuple(hazards), changed, tuple(item.column for item in made))
 
 
-def _unlike(out_a: Address, out_b: Address, table: str, run_id: str) -> tuple[pl.DataFrame, pl.DataFrame] | None:
+def _unlike_tables(out_a: Address, out_b: Address, table: str, run_id: str) -> tuple[pl.DataFrame, pl.DataFrame] | None:
     """One table of a run in both results; none where it is the same. Files of the same bytes are not opened."""
     content_a, content_b = (_recorded(out, table, run_id) for out in (out_a, out_b))
     if isinstance(content_a, bytes) and isinstance(content_b, bytes) and content_a == content_b:
         return None
-    a = _frame(out_a, table, run_id, content_a)
-    b = _frame(out_b, table, run_id, content_b)
+    a = _table_of(out_a, table, run_id, content_a)
+    b = _table_of(out_b, table, run_id, content_b)
     return None if a.equals(b) else (a, b)
 
 
@@ -211,7 +211,7 @@ def _changed_words(a: pl.DataFrame, b: pl.DataFrame, columns: Mapping[str, str],
         for solution in [name for name in before if name in after]:
             was, became = (unknown if of[solution] is None else of[solution] for of in (before, after))
             if before[solution] != after[solution]:
-                changed.append(_of(solution, a, b) + f"{words} {was} became {became}".strip())
+                changed.append(_solution_prefix(solution, a, b) + f"{words} {was} became {became}".strip())
     return tuple(changed)
 
 
@@ -226,7 +226,7 @@ def _passage_changes(a: pl.DataFrame, b: pl.DataFrame) -> tuple[str, ...]:
         if was != became:
             moved.setdefault((solution, was, became), []).append(balise)
     return tuple(
-        f"{_of(solution, a, b)}{' '.join(balises)}: {was} became {became}"
+        f"{_solution_prefix(solution, a, b)}{' '.join(balises)}: {was} became {became}"
         for (solution, was, became), balises in moved.items()
     )
 
@@ -239,7 +239,7 @@ def _statuses(passages: pl.DataFrame) -> dict[tuple[str, str], str]:
     return {(solution, balise): ", ".join(statuses) for solution, balise, statuses in listed.iter_rows()}
 
 
-def _of(solution: str, a: pl.DataFrame, b: pl.DataFrame) -> str:
+def _solution_prefix(solution: str, a: pl.DataFrame, b: pl.DataFrame) -> str:
     """The solution in front, where there is more than one."""
     several = pl.concat([a["solution"], b["solution"]]).n_unique() > 1
     return f"{solution}: " if several else ""
@@ -251,19 +251,19 @@ def _recorded(out: Address, table: str, run_id: str) -> bytes | pl.DataFrame:
         return packed
     content = storage.content_of(store.table_address(out, table, run_id))
     if content is None:
-        raise _unreadable(out, table, run_id, "is missing from a complete run")
+        raise _unreadable_error(out, table, run_id, "is missing from a complete run")
     return content
 
 
-def _frame(out: Address, table: str, run_id: str, recorded: bytes | pl.DataFrame) -> pl.DataFrame:
+def _table_of(out: Address, table: str, run_id: str, recorded: bytes | pl.DataFrame) -> pl.DataFrame:
     """A table of a run, in whatever form it was recorded."""
     try:
         return read_parquet(recorded) if isinstance(recorded, bytes) else recorded
     except ParquetError as error:
-        raise _unreadable(out, table, run_id, f"cannot be read: {error}") from None
+        raise _unreadable_error(out, table, run_id, f"cannot be read: {error}") from None
 
 
-def _unreadable(out: Address, table: str, run_id: str, reason: str) -> UsageError:
+def _unreadable_error(out: Address, table: str, run_id: str, reason: str) -> UsageError:
     """The error for a table that cannot be read."""
     place = redacted(str(store.table_address(out, table, run_id)))
     return UsageError(reason, place=place, remedy="Replay the run again with --force.")

@@ -38,32 +38,32 @@ class Rules:
         of_contract = float((column.metadata or {}).get("tolerance", 0.0)) if column is not None else 0.0
         return self.tolerances.get((table, name), of_contract)
 
-    def left(self, table: str, frame: pl.DataFrame) -> pl.DataFrame:
+    def compared_columns(self, table: str, frame: pl.DataFrame) -> pl.DataFrame:
         """The columns that are compared."""
         return frame.drop([name for of_table, name in self.ignored if of_table == table], strict=False)
 
 
 def rules_of(tolerances: Iterable[str], ignored: Iterable[str], file: Path | None) -> Rules:
     """`COLUMN=VALUE` and columns as given with the command, on top of those of a file. Raises `UsageError`."""
-    given = RulesFile() if file is None else _read(file)
+    given = RulesFile() if file is None else _read_rules(file)
     allowed = dict(given.tolerance)
     for text in tolerances:
         column, _, allowance = text.partition("=")
         allowed[column] = _number(allowance, f"--tolerance {text}")
     found: dict[tuple[str, str], float] = {}
     for name, value in allowed.items():
-        for table, column in _columns(name):
+        for table, column in _places_of_column(name):
             if not isinstance(TABLES[table].columns()[column], dy.Float64 | dy.Int64):
                 raise UsageError("is no number", place=f"tolerance of {name}", remedy="Leave it out with --ignore.")
             found[table, column] = value
-    left_out = frozenset(place for name in (*given.ignore, *ignored) for place in _columns(name))
+    left_out = frozenset(place for name in (*given.ignore, *ignored) for place in _places_of_column(name))
     keys = sorted({column for _, column in left_out} & {"solution", "t"})
     if keys:
         raise UsageError("tells the rows apart", place=f"--ignore {keys[0]}", expected="a column of figures")
     return Rules(found, left_out)
 
 
-def _read(file: Path) -> RulesFile:
+def _read_rules(file: Path) -> RulesFile:
     """A file of rules."""
     try:
         content = file.read_bytes()
@@ -83,7 +83,7 @@ def _number(text: str, place: str) -> float:
     return value
 
 
-def _columns(name: str) -> list[tuple[str, str]]:
+def _places_of_column(name: str) -> list[tuple[str, str]]:
     """The places of a column: one table where the name says which, else all that have it."""
     table, _, column = name.rpartition(".")
     among = TABLES if not table else {table: TABLES[table]} if table in TABLES else {}

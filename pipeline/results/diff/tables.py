@@ -56,14 +56,14 @@ def compare_tables(
         The differences, none where the tables are the same.
     """
     name = contract.__name__.lower()
-    a, b = (rules.left(name, frame) for frame in (a, b))
+    a, b = (rules.compared_columns(name, frame) for frame in (a, b))
     differences = [Difference(name, "schema", *what) for what in _schema_differences(a, b)]
     was, became = a.schema, b.schema  # each look at a schema makes the types of all columns anew
     common = [column for column, dtype in was.items() if became.get(column) == dtype]
     if not set(keys) <= set(common):
         return differences
     if keys:
-        counted, a, b = _paired(name, a, b, keys)
+        counted, a, b = _pair_rows(name, a, b, keys)
         differences += counted
     elif a.height != b.height:
         rows = abs(a.height - b.height)
@@ -89,7 +89,7 @@ def _schema_differences(a: pl.DataFrame, b: pl.DataFrame) -> Iterator[tuple[str,
             yield column, f"{was[column]} became {became[column]}"
 
 
-def _paired(
+def _pair_rows(
     table: str, a: pl.DataFrame, b: pl.DataFrame, keys: tuple[str, ...]
 ) -> tuple[list[Difference], pl.DataFrame, pl.DataFrame]:
     """The rows that stand in both, in the order of `a`; a key that stands twice counts by its turn."""
@@ -98,7 +98,7 @@ def _paired(
     differences = []
     for word, rows in (("lost", _join_rows(a, b, by, "anti")), ("new", _join_rows(b, a, by, "anti"))):
         if rows.height:
-            first = ", ".join(f"{key} {_text(rows[key][0])}" for key in keys)
+            first = ", ".join(f"{key} {_value_words(rows[key][0])}" for key in keys)
             differences.append(Difference(table, "rows", "", f"{rows.height} rows {word}, first: {first}", rows.height))
     kept = _join_rows(a, b, by, "semi")
     partners = _join_rows(kept.select(by), b, by, "left").select(b.columns)
@@ -106,6 +106,7 @@ def _paired(
 
 
 def _join_rows(a: pl.DataFrame, b: pl.DataFrame, by: list[str], how: Literal["anti", "semi", "left"]) -> pl.DataFrame:
+    """Join with equal nulls, in the order of `a`."""
     return a.join(b, on=by, how=how, nulls_equal=True, maintain_order="left")
 
 
@@ -121,7 +122,9 @@ def _values_differ(a: pl.Series, b: pl.Series, tolerance: float) -> tuple[str, i
     if rows == 0:
         return None
     first = differs.arg_true()[0]
-    message = f"{rows} of {a.len()} rows differ, first row {first}: {_text(a[first])} became {_text(b[first])}"
+    message = (
+        f"{rows} of {a.len()} rows differ, first row {first}: {_value_words(a[first])} became {_value_words(b[first])}"
+    )
     if a.dtype.is_float():
         largest = (a - b).abs().filter(differs).drop_nans().max()
         if isinstance(largest, float):
@@ -129,7 +132,7 @@ def _values_differ(a: pl.Series, b: pl.Series, tolerance: float) -> tuple[str, i
     return message, rows
 
 
-def _text(value: object) -> str:
+def _value_words(value: object) -> str:
     """A value for people."""
     if value is None:
         return "null"

@@ -70,13 +70,20 @@ def measured_figures(runs: pl.DataFrame, hazards: pl.DataFrame, config: SafetyCo
     is not shown to be within the budget.
     """
     done = counted_runs(runs, hazards).filter(pl.col("status") != RunStatus.FAILED)
-    sums = done.sort("run_id").group_by("solution").agg(**_sums(), **_shares(), **spacing_of_runs()).sort("solution")
+    sums = (
+        done.sort("run_id")
+        .group_by("solution")
+        .agg(**_sum_expressions(), **_share_expressions(), **spacing_of_runs())
+        .sort("solution")
+    )
     thr = config.thr_vb_per_h
     against_thr: dict[str, Sequence[float | None]] = {
         "runs_failed": [failed_runs(runs, name) for name in sums["solution"]],
-        "beyond_budget_rate_upper_per_h": _of_open_cases(sums, poisson_rate_upper),
-        "hours_needed": _of_open_cases(sums, lambda failures, _: hours_to_substantiate(thr, failures)),
-        "hours_still_needed": _of_open_cases(sums, lambda failures, hours: hours_still_needed(thr, failures, hours)),
+        "beyond_budget_rate_upper_per_h": _figure_of_open_cases(sums, poisson_rate_upper),
+        "hours_needed": _figure_of_open_cases(sums, lambda failures, _: hours_to_substantiate(thr, failures)),
+        "hours_still_needed": _figure_of_open_cases(
+            sums, lambda failures, hours: hours_still_needed(thr, failures, hours)
+        ),
     }
     kinds = dtypes(CampaignFigures)
     columns = [pl.Series(name, values, kinds[name]) for name, values in against_thr.items()]
@@ -90,14 +97,14 @@ def failed_runs(runs: pl.DataFrame, solution: str) -> int:
     return runs.filter(concerned & (pl.col("status") == RunStatus.FAILED))["run_id"].n_unique()
 
 
-def _of_open_cases(sums: pl.DataFrame, figure: Callable[[int, float], float | None]) -> list[float | None]:
+def _figure_of_open_cases(sums: pl.DataFrame, figure: Callable[[int, float], float | None]) -> list[float | None]:
     """A figure of the failures not shown to be within the budget, and the hours judged by a truth."""
     columns = ("failures", "failures_within_budget", "truth_h")
     return [figure(failures - within, hours) for failures, within, hours in sums.select(columns).iter_rows()]
 
 
-def _sums() -> dict[str, pl.Expr]:
-    """What is added up over the runs of one solution."""
+def _sum_expressions() -> dict[str, pl.Expr]:
+    """Expressions for what is added up over the runs of one solution."""
     evidence = pl.col("evidence")
     judged = pl.col("false_alarm_rate_per_h").is_not_null()
     truth = evidence.is_in(TRUTH)
@@ -122,11 +129,11 @@ def _sums() -> dict[str, pl.Expr]:
     return sums
 
 
-def _shares() -> dict[str, pl.Expr]:
-    """Shares of the time in P0 to P3, all of the same time, and what is left: the state is not known.
+def _share_expressions() -> dict[str, pl.Expr]:
+    """Expressions for shares of the time in P0 to P3, all of the same time, and of time in no known state.
 
     P0 and P1 need a truth, so that the time is that of the runs with one. What the odometer alone tells of the error is
-    not good enough to call a position right. Without a truth P2 and P3 are those of all runs.
+    not good enough.
     """
     held = pl.col("held_s").fill_null(0.0)
     truth = pl.col("truth_held_s") > 0.0
@@ -151,11 +158,13 @@ def detection_by_level(runs: pl.DataFrame, hazards: pl.DataFrame, levels: pl.Dat
     spent = pl.col("hazardous_s")
     may = pl.col("hazardous_may_s")
     of_failures = (
-        failures_of(runs)
+        failures_table(runs)
         .group_by("solution")
-        .agg(failures=pl.len(), hazardous_may_max_s=may.max(), **_quantiles(spent, "hazardous"))
+        .agg(failures=pl.len(), hazardous_may_max_s=may.max(), **_quantile_expressions(spent, "hazardous"))
     )
-    times = {key: value for name in DETECTION_TIMES for key, value in _quantiles(pl.col(name), name[:-2]).items()}
+    times = {
+        key: value for name in DETECTION_TIMES for key, value in _quantile_expressions(pl.col(name), name[:-2]).items()
+    }
     detected = pl.col("time_to_detect_s").count()
     of_episodes = independent_episodes(hazards).group_by("solution").agg(detected=detected, **times)
     measured = of_failures.join(of_episodes, on="solution", how="full", coalesce=True).sort("solution")
@@ -176,14 +185,14 @@ def detection_by_level(runs: pl.DataFrame, hazards: pl.DataFrame, levels: pl.Dat
     return conform(with_estimates(table, share), CampaignDetection)
 
 
-def failures_of(runs: pl.DataFrame) -> pl.DataFrame:
+def failures_table(runs: pl.DataFrame) -> pl.DataFrame:
     """One row per failure of all runs: `run_id, solution, hazardous_s, hazardous_may_s`."""
     columns = {"hazardous_s": "failure_hazardous_s", "hazardous_may_s": "failure_hazardous_may_s"}
     return runs.filter(pl.col("failures") > 0).select("run_id", "solution", **columns).explode(*columns)
 
 
-def _quantiles(values: pl.Expr, name: str) -> dict[str, pl.Expr]:
-    """Median and 95th percentile."""
+def _quantile_expressions(values: pl.Expr, name: str) -> dict[str, pl.Expr]:
+    """Expressions for median, 95th percentile and largest of some times [s]."""
     return {
         f"{name}_median_s": values.median(),
         f"{name}_p95_s": values.quantile(0.95, interpolation="linear"),

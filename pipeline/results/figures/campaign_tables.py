@@ -32,7 +32,7 @@ from schemas.enums import TRUTH, BaliseKind, FailureMode, LinkingError
 
 
 def undetected_spread() -> dict[str, pl.Expr]:
-    """The larger of both directions over the passages of one balise; how far before a physical one may lie."""
+    """Expressions for the larger undetected error of both directions at one balise, and how far before one may lie."""
     larger = pl.max_horizontal("undetected_ahead_m", "undetected_behind_m")
     before = pl.col("physical_before_m")
     return {
@@ -48,11 +48,7 @@ def undetected_spread() -> dict[str, pl.Expr]:
 
 
 def spacing_of_runs() -> dict[str, pl.Expr]:
-    """The shortest spacing over the runs of one solution, and the share of runs that keep it, from below.
-
-    None of n runs fell short of their own shortest: with 95 % confidence, one-sided as of claims (DOMAIN section 6), a
-    share of 0.05^(1/n) does not (Clopper and Pearson, n of n).
-    """
+    """Expressions for the shortest spacing over the runs of one solution, and the share of runs that keep it."""
     runs = pl.col("physical_spacing_starts").count()
     share = pl.when(runs > 0).then(pl.lit(1.0 - CONFIDENCE).pow(1.0 / runs))
     return {
@@ -158,13 +154,13 @@ def with_truth(passages: pl.DataFrame, runs: pl.DataFrame) -> pl.DataFrame:
     return joined.with_columns(pl.col("truth").fill_null(value=False))
 
 
-def _spread() -> dict[str, pl.Expr]:
-    """Spread of the location errors [m] of acceptances."""
+def _location_error_spread() -> dict[str, pl.Expr]:
+    """Expressions for the spread of the location errors [m] of acceptances."""
     error = pl.col("location_error_m").filter(is_accepted())
     return {**error_spread(error, "location_error", "count"), "location_error_sigma_m": error.std()}
 
 
-def _counts() -> dict[str, pl.Expr]:
+def _count_conditions() -> dict[str, pl.Expr]:
     """Conditions on passages (`with_truth`): in how many rows each holds."""
     mode = pl.col("failure_mode")
     passage = is_passage()
@@ -191,13 +187,13 @@ def campaign_balises(passages: pl.DataFrame) -> pl.DataFrame:
     the acceptances that a truth judged. `passages`: `with_truth`.
     """
     table = (
-        _in_order(passages)
+        _sort_by_run(passages)
         .group_by("solution", "balise_id", "kind", maintain_order=True)
         .agg(
             pl.col("netelement_id", "measure_m").first(),
             runs=pl.col("run_id").n_unique().cast(pl.Int64),
-            **_counts(),
-            **_spread(),
+            **_count_conditions(),
+            **_location_error_spread(),
             **undetected_spread(),
         )
         .pipe(
@@ -210,7 +206,7 @@ def campaign_balises(passages: pl.DataFrame) -> pl.DataFrame:
     return conform(table.sort("solution", "kind", "balise_id"), CampaignBalises)
 
 
-def _in_order(passages: pl.DataFrame) -> pl.DataFrame:
+def _sort_by_run(passages: pl.DataFrame) -> pl.DataFrame:
     """Rows by run, in each run as they stand: sums of floats then do not depend on the order of runs."""
     return passages.sort("run_id", maintain_order=True)
 
@@ -225,12 +221,12 @@ def campaign_accuracy(passages: pl.DataFrame, config: Configuration) -> pl.DataF
     values = ("solution", "status", "location_error_m", "location_accuracy_m")
     groups = {"all": pl.lit(""), "netelement_id": pl.col("netelement_id"), "speed_band_kmh": _speed_band()}
     grouped = (
-        _in_order(passages)
+        _sort_by_run(passages)
         .filter(known)
         .select(*values, **groups)
         .unpivot(list(groups), index=values, variable_name="grouped_by", value_name="group")
     )
-    return conform(_accuracy(grouped, config), CampaignAccuracy)
+    return conform(_accuracy_by_group(grouped, config), CampaignAccuracy)
 
 
 def _speed_band() -> pl.Expr:
@@ -242,7 +238,7 @@ def _speed_band() -> pl.Expr:
     return band.fill_null("unknown")
 
 
-def _accuracy(offers: pl.DataFrame, config: Configuration) -> pl.DataFrame:
+def _accuracy_by_group(offers: pl.DataFrame, config: Configuration) -> pl.DataFrame:
     """Location errors of groups of balises, against the accuracy they state."""
     keys = ["grouped_by", "solution", "group"]
     size = pl.col("location_error_m").abs()
@@ -251,7 +247,7 @@ def _accuracy(offers: pl.DataFrame, config: Configuration) -> pl.DataFrame:
     counted = (
         offers.group_by(keys, maintain_order=True)
         .agg(
-            **_spread(),
+            **_location_error_spread(),
             location_error_median_m=pl.col("location_error_m").median(),
             location_accuracy_m=own_m.min(),
             location_accuracy_max_m=own_m.max(),

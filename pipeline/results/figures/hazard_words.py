@@ -25,11 +25,11 @@ def hazard_words(hazards: pl.DataFrame, passages: pl.DataFrame) -> list[str]:
         return []
     faults = hazards.filter(pl.col("caused_by").is_null())
     wrong = _wrong_acceptances(passages)
-    ranked = sorted(faults.iter_rows(named=True), key=_badness)
-    return [_phrase(row, wrong.get((row["solution"], row["hazard_id"]))) for row in ranked]
+    ranked = sorted(faults.iter_rows(named=True), key=_order_by_badness)
+    return [_hazard_phrase(row, wrong.get((row["solution"], row["hazard_id"]))) for row in ranked]
 
 
-def withstood(hazards: pl.DataFrame) -> str:
+def withstood_words(hazards: pl.DataFrame) -> str:
     """What a safe run came through: `2 jumps of up to 300 m negated within 0.2 s, 1 shift that no monitor saw`."""
     faults = hazards.filter(pl.col("caused_by").is_null())
     kinds = pl.col("hazard").cast(pl.String).replace_strict({kind.value: _say(kind.value) for kind in Hazard})
@@ -37,11 +37,12 @@ def withstood(hazards: pl.DataFrame) -> str:
     for (kind,), rows in faults.group_by(kinds, maintain_order=True):
         for (detected,), part in rows.group_by("detected", maintain_order=True):
             response = _response_words(part, detected=bool(detected))
-            parts.append(f"{part.height} {kind}{'s' * (part.height > 1)}{_sizes(part['size_m'])} {response}")
+            parts.append(f"{part.height} {kind}{'s' * (part.height > 1)}{_size_words(part['size_m'])} {response}")
     return ", ".join(parts)
 
 
-def _sizes(size_m: pl.Series) -> str:
+def _size_words(size_m: pl.Series) -> str:
+    """How large the largest of these errors is, in words; nothing where no size is known."""
     largest_m = size_m.abs().max()
     if largest_m is None:
         return ""
@@ -66,23 +67,26 @@ def _wrong_acceptances(passages: pl.DataFrame) -> dict[tuple[str, int], Row]:
     return {(row["solution"], row["hazard_id"]): row for row in rows.iter_rows(named=True)}
 
 
-def _badness(row: Row) -> tuple[Any, ...]:
-    """Accepted ones first, then those that no monitor saw, those too late, the larger ones."""
+def _order_by_badness(row: Row) -> tuple[Any, ...]:
+    """What hazards are sorted by: accepted ones first, then undetected ones, those too late, the larger ones."""
     late = {False: 0, None: 1, True: 2}[row["within_budget"]]
     return (not row["accepted_ids"], row["detected"], late, -abs(row["size_m"] or 0.0), row["hazard_id"])
 
 
-def _phrase(row: Row, wrong: Row | None) -> str:
+def _hazard_phrase(row: Row, wrong: Row | None) -> str:
     """`VB_JUMP_1B: VB04 accepted 303.6 m early; no monitor saw it`, or `VB_SHIFT: VB03 40 m late, not accepted; ...`.
 
     `wrong`: the worst of the wrong acceptances of the row; a balise is as far off as its own location error says,
     not as the fault at its largest.
     """
-    what = f"{_hit(row)}, {_accepted(row)}" if wrong is None else _wrongly_accepted(row, wrong)
-    return f"{row['hazard']}: {what}; {_seen(row)}{_in_use(row)}"
+    what = (
+        f"{_balises_hit_words(row)}, {_acceptance_words(row)}" if wrong is None else _wrong_acceptance_words(row, wrong)
+    )
+    return f"{row['hazard']}: {what}; {_detection_words(row)}{_use_words(row)}"
 
 
-def _wrongly_accepted(row: Row, wrong: Row) -> str:
+def _wrong_acceptance_words(row: Row, wrong: Row) -> str:
+    """Which balise was accepted how far off, and how many others."""
     error_m = wrong["location_error_m"]
     others = len(row["accepted_ids"] or []) - 1
     more = _say("more", others) if others > 0 else ""
@@ -91,28 +95,29 @@ def _wrongly_accepted(row: Row, wrong: Row) -> str:
     return _say("accepted_early" if error_m > 0 else "accepted_late", wrong["balise_id"], abs(error_m)) + more
 
 
-def _hit(row: Row) -> str:
+def _balises_hit_words(row: Row) -> str:
     """The balises that it hit, how far off and to which side."""
-    off = _off(row["size_m"], row["timing"])
-    return " ".join(text for text in (_some(row["balise_ids"]) or _say("no_balise"), off) if text)
+    off = _offset_words(row["size_m"], row["timing"])
+    return " ".join(text for text in (_names_in_short(row["balise_ids"]) or _say("no_balise"), off) if text)
 
 
-def _off(size_m: float | None, timing: Timing | str | None) -> str:
+def _offset_words(size_m: float | None, timing: Timing | str | None) -> str:
     """`502 m early`, `3 m off` where the side is not known, `late` where the size is not; nothing where neither is."""
     size = "" if size_m is None else f"{abs(size_m):.0f} m"
     side = "" if timing in (None, Timing.NONE) else str(timing)
     return " ".join(text for text in (size, side or "off" * bool(size)) if text)
 
 
-def _accepted(row: Row) -> str:
+def _acceptance_words(row: Row) -> str:
+    """Which of the balises hit were accepted."""
     accepted = row["accepted_ids"] or []
     hit = row["balise_ids"] or []
     if not accepted:
         return _say("not_accepted")
-    return _say("accepted") if set(accepted) == set(hit) else f"{_some(accepted)} {_say('accepted')}"
+    return _say("accepted") if set(accepted) == set(hit) else f"{_names_in_short(accepted)} {_say('accepted')}"
 
 
-def _seen(row: Row) -> str:
+def _detection_words(row: Row) -> str:
     """Which monitor saw it, and how late; a drift against its failure, since its onset may be the alarm itself."""
     if not row["detected"]:
         return _say("unseen")
@@ -124,12 +129,12 @@ def _seen(row: Row) -> str:
     return _say("seen", row["monitor"]) if late_s is None else _say("seen_after_onset", row["monitor"], late_s)
 
 
-def _in_use(row: Row) -> str:
+def _use_words(row: Row) -> str:
     """How long its position was in use, where that was too long."""
     return _say("in_use", row["hazardous_s"], row["budget_s"]) if row["within_budget"] is False else ""
 
 
-def _some(names: Iterable[str] | None) -> str:
+def _names_in_short(names: Iterable[str] | None) -> str:
     """`VB03`, `VB03 VB04`, `VB03 to VB09 (7)`: as many as a line takes."""
     listed = list(names or [])
     return " ".join(listed) if len(listed) < 3 else f"{listed[0]} to {listed[-1]} ({len(listed)})"

@@ -18,7 +18,7 @@ def map_suspects(alarms: pl.DataFrame, reach_m: float) -> pl.DataFrame:
     such an alarm of another run on the same net element.
     """
     numbered = alarms.with_row_index("_row")
-    due = pl.col("_row").is_in(_repeated(numbered, reach_m)["_row"].implode())
+    due = pl.col("_row").is_in(_repeated_alarms(numbered, reach_m)["_row"].implode())
     kind = alarms.schema["suspect"]
     return numbered.with_columns(
         pl.when(due).then(pl.lit(Suspect.MAP.value, kind)).otherwise(pl.col("suspect")).alias("suspect")
@@ -29,7 +29,7 @@ def map_places(alarms: pl.DataFrame, reach_m: float) -> pl.DataFrame:
     """Places at which several runs raised such alarms (`campaign_map`), by net element and measure."""
     apart = (pl.col("measure_m").diff() > reach_m).fill_null(value=True)
     places = (
-        _repeated(alarms.with_row_index("_row"), reach_m)
+        _repeated_alarms(alarms.with_row_index("_row"), reach_m)
         .sort("netelement_id", "measure_m", "run_id", "solution", "_row")
         .with_columns(place=apart.over("netelement_id").cum_sum().over("netelement_id"))
         .group_by("netelement_id", "place", maintain_order=True)
@@ -46,7 +46,7 @@ def map_places(alarms: pl.DataFrame, reach_m: float) -> pl.DataFrame:
     return conform(places, CampaignMap)
 
 
-def _repeated(alarms: pl.DataFrame, reach_m: float) -> pl.DataFrame:
+def _repeated_alarms(alarms: pl.DataFrame, reach_m: float) -> pl.DataFrame:
     """Alarms across the track alone, whose position is not proved wrong, near such an alarm of another run."""
     across = (pl.col("monitors").list.len() > 0) & pl.col("monitors").list.eval(
         pl.element().str.contains(_ACROSS)

@@ -17,7 +17,7 @@ Entry = tuple[int, int, str, str]
 def hazard_entries(hazards: pl.DataFrame) -> list[Entry]:
     """Time [ns], level, name, text: what a hazard is, and when it was detected, failed and ended."""
     entries: list[Entry] = []
-    for row in _plain(hazards):
+    for row in _rows_of(hazards):
         name = f"hazard {row['hazard_id']}"
         entries.append((row["t_hazard"], Level.ERROR, name, hazard_text(row)))
         moments = (
@@ -43,7 +43,7 @@ def hazard_text(row: Row) -> str:
 def passage_entries(passages: pl.DataFrame) -> list[Entry]:
     """Entries of the passages, at the time the balise was offered, else passed."""
     entries: list[Entry] = []
-    for row in _plain(passages):
+    for row in _rows_of(passages):
         t_ns = row["t_offered"] if row["t_offered"] is not None else row["t_true"]
         if t_ns is None:
             continue
@@ -56,6 +56,7 @@ def passage_entries(passages: pl.DataFrame) -> list[Entry]:
     return entries
 
 
-def _plain(frame: pl.DataFrame) -> list[dict[str, Any]]:
+def _rows_of(frame: pl.DataFrame) -> list[dict[str, Any]]:
+    """Rows with times in nanoseconds since 1970."""
     times = [name for name, dtype in frame.schema.items() if isinstance(dtype, pl.Datetime)]
     return frame.with_columns(pl.col(times).to_physical()).to_dicts()

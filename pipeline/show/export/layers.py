@@ -70,13 +70,15 @@ def geopackage_bytes(layers: Mapping[str, pl.DataFrame], place: Path) -> bytes:
             file = Path(folder, "layers.gpkg")
             for number, (name, layer) in enumerate(layers.items()):
                 shape = {"geometry_name": "geometry", "geometry_type": "Point", "crs": "OGC:CRS84"}
-                write_arrow(_plain(layer).to_arrow(), file, layer=name, driver="GPKG", append=number > 0, **shape)
+                write_arrow(
+                    _with_plain_types(layer).to_arrow(), file, layer=name, driver="GPKG", append=number > 0, **shape
+                )
             return file.read_bytes()
     finally:
         pyogrio.set_gdal_config_options({"OGR_CURRENT_DATE": None})
 
 
-def _plain(layer: pl.DataFrame) -> pl.DataFrame:
+def _with_plain_types(layer: pl.DataFrame) -> pl.DataFrame:
     """The table with the types that a GeoPackage has."""
     lists = [name for name, kind in layer.schema.items() if isinstance(kind, pl.List)]
     enums = [name for name, kind in layer.schema.items() if isinstance(kind, pl.Enum)]

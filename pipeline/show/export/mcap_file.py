@@ -11,7 +11,6 @@ from pathlib import Path
 from typing import IO, Literal
 
 import polars as pl
-from schemas.monitors import MONITORS
 
 from pipeline.show.export.events import hazard_entries, passage_entries
 from pipeline.show.export.gis import balises_geojson, track_geojson
@@ -20,6 +19,7 @@ from pipeline.show.export.position_messages import location_fix_topic, navsatfix
 from pipeline.show.export.positions import as_gnss, positions_of
 from pipeline.storage import whole_file
 from pipeline.storage.described import PREFIX
+from schemas.monitors import MONITORS
 from schemas.run import RunLog, RunTables, Site
 
 PositionMessage = Literal["foxglove", "ros"]
@@ -88,15 +88,18 @@ def write_topics(
             )
             for topic in topics
         ]
-        for _, number, row in heapq.merge(*(_instants(number, topic) for number, topic in enumerate(topics))):
+        for _, number, row in heapq.merge(*(_write_order(number, topic) for number, topic in enumerate(topics))):
             t_ns = topics[number].times_ns[row]
             data = next(topics[number].messages)
             writer.add_message(channels[number], log_time=t_ns, publish_time=t_ns, sequence=row, data=data)
         writer.finish()  # type: ignore[no-untyped-call]
 
 
-def _instants(number: int, topic: Topic) -> Iterator[tuple[int, int, int]]:
-    """The running maximum orders topics among each other and leaves each topic's own order alone."""
+def _write_order(number: int, topic: Topic) -> Iterator[tuple[int, int, int]]:
+    """Time to sort by, topic and place of each message of a topic.
+
+    The time is the running maximum: so topics are ordered among each other, and each topic's own order stays.
+    """
     for row, t_ns in enumerate(accumulate(topic.times_ns, max)):
         yield t_ns, number, row
 
@@ -104,6 +107,7 @@ def _instants(number: int, topic: Topic) -> Iterator[tuple[int, int, int]]:
 def _position_topics(
     solution: str, tables: RunTables, site: Site | None, log: RunLog | None, positions: PositionMessage
 ) -> list[Topic]:
+    """Topics of recorded, used, matched and true positions, as far as log and site are there."""
     topics = []
     if log is not None:
         raw = log.gnss.filter(pl.col("solution") == solution)
@@ -116,18 +120,19 @@ def _position_topics(
 
 
 def _result_topics(solution: str, tables: RunTables, encoding: Encoding) -> list[Topic]:
+    """Topics of LDS, monitors, hazards and passages."""
     epochs, hazards, passages = (
         frame.filter(pl.col("solution") == solution) for frame in (tables.epochs, tables.hazards, tables.passages)
     )
     return [
         rows_topic(f"/{solution}/lds", "balise.Lds", epochs.select(_LDS), encoding),
-        rows_topic(f"/{solution}/monitors", "balise.Monitors", _monitors(epochs), encoding),
+        rows_topic(f"/{solution}/monitors", "balise.Monitors", _monitor_columns(epochs), encoding),
         log_topic(f"/{solution}/hazards", hazard_entries(hazards), encoding),
         log_topic(f"/{solution}/passages", passage_entries(passages), encoding),
     ]
 
 
-def _monitors(epochs: pl.DataFrame) -> pl.DataFrame:
+def _monitor_columns(epochs: pl.DataFrame) -> pl.DataFrame:
     """Values, thresholds and states, and the ratio that viewers draw: beyond ±1 the monitor fails."""
     columns: list[pl.Expr] = [pl.col("t")]
     for name in MONITORS:
@@ -139,6 +144,7 @@ def _monitors(epochs: pl.DataFrame) -> pl.DataFrame:
 
 
 def _position_topic(topic: str, frame: pl.DataFrame, positions: PositionMessage) -> Topic:
+    """One topic of positions; rows without a position are left out."""
     known = frame.filter(pl.col("latitude_deg").is_not_null() & pl.col("longitude_deg").is_not_null())
     make = navsatfix_topic if positions == "ros" else location_fix_topic
     return make(topic, known, _FRAME)

@@ -65,7 +65,7 @@ def rows_topic(topic: str, name: str, frame: pl.DataFrame, encoding: Encoding) -
 
 def fields_of(frame: pl.DataFrame) -> Fields:
     """Columns and the kinds of field that hold them."""
-    return tuple((column, _kind(dtype)) for column, dtype in frame.schema.items())
+    return tuple((column, _field_kind(dtype)) for column, dtype in frame.schema.items())
 
 
 def log_topic(topic: str, entries: list[tuple[int, int, str, str]], encoding: Encoding) -> Topic:
@@ -93,7 +93,7 @@ def message_topic(
         return Topic(
             topic, "cdr", f"{package}_msgs/msg/{message}", "ros2msg", schema, times, cdr_messages(fields, rows)
         )
-    messages = (_message(name, fields, row) for row in rows)
+    messages = (_protobuf_message(name, fields, row) for row in rows)
     return Topic(topic, "protobuf", name, "protobuf", descriptor(name, fields), times, messages)
 
 
@@ -135,6 +135,7 @@ def _add_field(message: Any, name: str, number: int, field: str, kind: str) -> N
     from google.protobuf.descriptor_pb2 import FieldDescriptorProto
 
     def add(kind: str, **more: Any) -> None:
+        """Add a field of this kind."""
         label = more.pop("label", "OPTIONAL")
         of_type = FieldDescriptorProto.Type.Value(f"TYPE_{kind.upper()}")
         of_label = FieldDescriptorProto.Label.Value(f"LABEL_{label}")
@@ -158,7 +159,7 @@ def _add_field(message: Any, name: str, number: int, field: str, kind: str) -> N
         add(kind, proto3_optional=True, oneof_index=len(message.oneof_decl) - 1)
 
 
-def _kind(dtype: pl.DataType) -> str:
+def _field_kind(dtype: pl.DataType) -> str:
     """Kind of a field, of the type of its column."""
     if isinstance(dtype, pl.Datetime):
         return "time"
@@ -169,13 +170,13 @@ def _kind(dtype: pl.DataType) -> str:
     return "double" if dtype.is_float() else "string"
 
 
-def _message(name: str, fields: Fields, values: Mapping[str, Any]) -> bytes:
+def _protobuf_message(name: str, fields: Fields, values: Mapping[str, Any]) -> bytes:
     """A message in protobuf's encoding."""
-    times = {field: _stamp(values[field]) for field, kind in fields if kind == "time"}
+    times = {field: _protobuf_stamp(values[field]) for field, kind in fields if kind == "time"}
     return bytes(message_class(name, fields)(**{**values, **times}).SerializeToString(deterministic=True))
 
 
-def _stamp(t_ns: int | None) -> dict[str, int] | None:
+def _protobuf_stamp(t_ns: int | None) -> dict[str, int] | None:
     """Seconds and nanoseconds of a time."""
     return None if t_ns is None else dict(zip(("seconds", "nanos"), divmod(t_ns, NS_PER_S), strict=True))
 
@@ -214,11 +215,11 @@ def cdr_messages(fields: Fields, rows: Iterator[Mapping[str, Any]]) -> Iterator[
         content = bytearray()
         for name, kind in fields:
             value = row[name] if row[name] is not None else _UNKNOWN[kind]
-            _append(content, kind, value)
+            _append_cdr(content, kind, value)
         yield _HEADER + bytes(content)
 
 
-def _append(content: bytearray, kind: str, value: Any) -> None:
+def _append_cdr(content: bytearray, kind: str, value: Any) -> None:
     """Append a value in the encoding of CDR."""
     if kind == "time":
         seconds, rest = divmod(value, NS_PER_S)

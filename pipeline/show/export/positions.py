@@ -38,7 +38,9 @@ def positions_of(epochs: pl.DataFrame, site: Site) -> ExportedPositions:
     high_m = column["true_measure_high_m"]
     middle_m = np.where(high_m - low_m <= 2.0 * HazardConfig().known_error_m, 0.5 * (low_m + high_m), np.nan)
     truth = ground_of(site.track, epochs["true_netelement_ids"].list.first(), middle_m)
-    return ExportedPositions(_frame(epochs["t"], gnss), _frame(epochs["t"], rails), _frame(epochs["t"], truth))
+    return ExportedPositions(
+        _positions_frame(epochs["t"], gnss), _positions_frame(epochs["t"], rails), _positions_frame(epochs["t"], truth)
+    )
 
 
 _NEEDED = ("measure_m", "cross_track_m", "vertical_m", "true_measure_low_m", "true_measure_high_m")
@@ -50,7 +52,8 @@ def as_gnss(frame: pl.DataFrame) -> pl.DataFrame:
     return frame.with_columns(*unknown, fix=pl.lit("estimated"))
 
 
-def _frame(t: pl.Series, ground: GroundPositions) -> pl.DataFrame:
+def _positions_frame(t: pl.Series, ground: GroundPositions) -> pl.DataFrame:
+    """Places with their times, without those that are not known."""
     columns = {
         "latitude_deg": ground.latitude_deg,
         "longitude_deg": ground.longitude_deg,

@@ -51,7 +51,7 @@ def export_run(
     if to.suffix.lower() not in SUFFIXES:
         raise UsageError("has an unknown suffix", place=str(to), expected=" or ".join(SUFFIXES))
     tables = read_run(out, run_id)
-    _check(out, tables, site, log)
+    _require_same_inputs(out, tables, site, log)
     if to.suffix.lower() == ".mcap":
         return _write_mcap(tables, to, site, log, positions)
     if site is None:
@@ -67,8 +67,8 @@ def export_run(
     return [_write_text(to, make(tables, site))], []
 
 
-def _check(out: Path, tables: RunTables, site: Site | None, log: RunLog | None) -> None:
-    """Site and log have to be those of the replay, as far as the result tells."""
+def _require_same_inputs(out: Path, tables: RunTables, site: Site | None, log: RunLog | None) -> None:
+    """Refuse a site or log other than those of the replay, as far as the result tells."""
     known = completed_runs(out, [tables.run_id])[tables.run_id].get("site_digest", "")
     check_site(site, known, tables.run_id)
     digest = site.digest if site is not None else known
@@ -84,6 +84,7 @@ def _check(out: Path, tables: RunTables, site: Site | None, log: RunLog | None) 
 def _write_mcap(
     tables: RunTables, to: Path, site: Site | None, log: RunLog | None, positions: PositionMessage
 ) -> tuple[list[Path], list[str]]:
+    """Write a run as MCAP with its layout; the files, and what could not be written."""
     topics, missing = run_topics(tables, site, log, positions)
     write_topics(topics, to, "ros2" if positions == "ros" else "")
     layout = to.with_suffix(".layout.json")
@@ -101,6 +102,7 @@ def _write_geoparquet(tables: RunTables, to: Path, site: Site) -> list[Path]:
 
 
 def _write_text(path: Path, text: str) -> Path:
+    """Write a text; returns its path."""
     write_bytes(path, text.encode())
     return path
 
@@ -111,18 +113,25 @@ Panel = dict[str, Any]
 def layout_json(solution: str, with_positions: bool) -> str:
     """The layout as Foxglove imports it; the map stands where there are positions."""
     panels: dict[str, Panel] = {
-        "StateTransitions!states": _states(solution),
+        "StateTransitions!states": _state_panel(solution),
         "RosOut!hazards": {"searchTerms": [], "minLogLevel": 1, "topicToRender": f"/{solution}/hazards"},
-        "Plot!position": _plot([f"/{solution}/lds.{name}" for name in ("error_low_m", "error_high_m", "confidence_m")]),
-        "Plot!speed": _plot([f"/{solution}/lds.{name}" for name in ("speed_mps", "exposure_s")]),
-        **{f"Plot!{drawing}": _monitors(solution, drawing) for drawing in DRAWINGS},
+        "Plot!position": _plot_panel(
+            [f"/{solution}/lds.{name}" for name in ("error_low_m", "error_high_m", "confidence_m")]
+        ),
+        "Plot!speed": _plot_panel([f"/{solution}/lds.{name}" for name in ("speed_mps", "exposure_s")]),
+        **{f"Plot!{drawing}": _monitor_panel(solution, drawing) for drawing in DRAWINGS},
     }
     left = ["StateTransitions!states", "RosOut!hazards"]
     if with_positions:
         panels["map!plan"] = {"layer": "map", "followTopic": f"/{solution}/matched", "zoomLevel": 14}
         left.insert(0, "map!plan")
     right = [name for name in panels if name.startswith("Plot!")]
-    layout = {"direction": "row", "first": _stack(left), "second": _stack(right), "splitPercentage": 45}
+    layout = {
+        "direction": "row",
+        "first": _stacked_panels(left),
+        "second": _stacked_panels(right),
+        "splitPercentage": 45,
+    }
     document = {
         "configById": panels,
         "globalVariables": {},
@@ -133,28 +142,35 @@ def layout_json(solution: str, with_positions: bool) -> str:
     return json.dumps(document, indent=2) + "\n"
 
 
-def _stack(names: list[str]) -> str | dict[str, Any]:
+def _stacked_panels(names: list[str]) -> str | dict[str, Any]:
     """Panels one over the other, each of the same height."""
     if len(names) == 1:
         return names[0]
     share = 100.0 / len(names)
-    return {"direction": "column", "first": names[0], "second": _stack(names[1:]), "splitPercentage": round(share, 3)}
+    return {
+        "direction": "column",
+        "first": names[0],
+        "second": _stacked_panels(names[1:]),
+        "splitPercentage": round(share, 3),
+    }
 
 
-def _states(solution: str) -> Panel:
+def _state_panel(solution: str) -> Panel:
+    """A panel of LDS and judgement over time."""
     names = ("lds_mode", "lds_state", "judgement", "tvb", "alarm")
     paths = [{"value": f"/{solution}/lds.{name}", "timestampMethod": "receiveTime"} for name in names]
     return {"paths": paths, "isSynced": True}
 
 
-def _monitors(solution: str, drawing: str) -> Panel:
-    """The monitors of one drawing, over their thresholds."""
+def _monitor_panel(solution: str, drawing: str) -> Panel:
+    """A panel of the monitors of one drawing over time, as ratios to their thresholds."""
     names = [monitor.name for monitor in ALL_MONITORS if monitor.drawing == drawing]
     limits = [{"value": limit, "enabled": True, "timestampMethod": "receiveTime"} for limit in ("1", "-1")]
-    panel = _plot([f"/{solution}/monitors.{name}_ratio" for name in names])
+    panel = _plot_panel([f"/{solution}/monitors.{name}_ratio" for name in names])
     return panel | {"paths": [*panel["paths"], *limits], "minYValue": -3, "maxYValue": 3}
 
 
-def _plot(values: list[str]) -> Panel:
+def _plot_panel(values: list[str]) -> Panel:
+    """A panel of lines over time."""
     paths = [{"value": value, "enabled": True, "timestampMethod": "receiveTime"} for value in values]
     return {"paths": paths, "showLegend": True, "isSynced": True, "xAxisVal": "timestamp"}

@@ -21,8 +21,8 @@ _COLUMNS = (
 )
 
 
-def outcome() -> pl.Expr:
-    """What became of a passage, of `OUTCOMES`."""
+def outcome_of_passage() -> pl.Expr:
+    """Expression on passages: what became of the balise, of `OUTCOMES`."""
     return (
         pl.when(pl.col("status") != PassageStatus.ACCEPTED.value)
         .then(pl.lit("lost"))

@@ -8,11 +8,11 @@ from html import escape
 
 import polars as pl
 
-from pipeline.results.figures.campaign_figures import failures_of
+from pipeline.results.figures.campaign_figures import failures_table
 from pipeline.results.figures.head import HAZARD_COUNTS, head_of, known_counts, run_verdicts, word_of
 from pipeline.results.places import origin_of
-from pipeline.show.report.balises import architectures_section, balise_table, lost_shares, outcome
-from pipeline.show.report.columns import Row, figures, frame_table
+from pipeline.show.report.balises import architectures_section, balise_table, lost_shares, outcome_of_passage
+from pipeline.show.report.columns import Row, figures_table, frame_table
 from pipeline.show.report.ground import availability_map
 from pipeline.show.report.headline import campaign_headline, run_headline
 from pipeline.show.report.markup import (
@@ -30,8 +30,8 @@ from pipeline.show.report.markup import (
     tiles,
     verdict_head,
 )
-from pipeline.show.report.run_page import ALLOWED, Made, configuration, hazard_cell
-from pipeline.show.report.words import plots_of, plural
+from pipeline.show.report.run_page import ALLOWED, Made, configuration_html, hazard_cell
+from pipeline.show.report.words import count_words, plots_of
 from pipeline.studies.safety.sentences import level_statements, plain_statements
 from schemas.campaign import CampaignDetection, CampaignFigures, CampaignMap, CampaignRuns
 from schemas.enums import TRUTH, Hazard, RunVerdict
@@ -82,12 +82,12 @@ def campaign_page(campaign: Campaign, made: Made) -> str:
     counts = head_of(run_verdicts(campaign.runs).values()).counts()
     body = [
         tiles((f"runs {name}", str(count), _TONES[name] if count else "") for name, count in counts.items()),
-        pairs(_facts(campaign, solutions)),
+        pairs(_fact_rows(campaign, solutions)),
         section("runs", "Runs", _pages_on_demand(campaign), _runs_table(campaign)),
-        *(_solution(f"s{index}", name, campaign, len(solutions) > 1) for index, name in enumerate(solutions)),
+        *(_solution_section(f"s{index}", name, campaign, len(solutions) > 1) for index, name in enumerate(solutions)),
         architectures_section("architectures", campaign.architectures),
         _map_in_doubt(campaign.derived["map"]),
-        _provenance(campaign.runs, made),
+        _provenance_section(campaign.runs, made),
     ]
     safety = made.config.safety
     data = {
@@ -99,7 +99,7 @@ def campaign_page(campaign: Campaign, made: Made) -> str:
     }
     href = campaign.hrefs.get(named or "", "")
     link_to_run = f'<p class="ways">{link(href, f"Open run {named}")}</p>' if href else ""
-    count = plural(campaign.runs["run_id"].n_unique(), "run")
+    count = count_words(campaign.runs["run_id"].n_unique(), "run")
     heading = (
         verdict_head(head.word, head.worst, head.reasons, head.figures) + link_to_run + f"<h1>Campaign of {count}</h1>"
     )
@@ -108,15 +108,17 @@ def campaign_page(campaign: Campaign, made: Made) -> str:
     return page(title, heading, "\n".join(body), script_json(data), "campaign.js", foot)
 
 
-def _only(frame: pl.DataFrame, name: str) -> pl.DataFrame:
+def _rows_of_solution(frame: pl.DataFrame, name: str) -> pl.DataFrame:
+    """Rows of one solution."""
     return frame.filter(pl.col("solution") == name)
 
 
-def _facts(campaign: Campaign, solutions: list[str]) -> list[tuple[str, str]]:
+def _fact_rows(campaign: Campaign, solutions: list[str]) -> list[tuple[str, str]]:
     """When, where, with what, by which program."""
     runs = campaign.runs
     begun, ended = runs.select(pl.col("t_start").min(), pl.col("t_end").max()).row(0)
     elements = campaign.pieces["netelement_id"].n_unique()
+    balises = campaign.passages["balise_id"].n_unique()
     trains = runs["vehicle"].cast(pl.String).fill_null("not known").value_counts(sort=True)
     rates = runs["gnss_rate_hz"].drop_nulls().unique().sort().to_list()
     once = runs.unique("run_id")
@@ -126,7 +128,7 @@ def _facts(campaign: Campaign, solutions: list[str]) -> list[tuple[str, str]]:
     lines = {
         "Dates": f"{begun:%Y-%m-%d %H:%M} to {ended:%Y-%m-%d %H:%M} UTC" if begun and ended else "not known",
         "Ridden": f"{number(hours)} h, {number(km)} km",
-        "Line": f"{plural(elements, 'net element')}, {plural(campaign.passages['balise_id'].n_unique(), 'balise')} met",
+        "Line": f"{count_words(elements, 'net element')}, {count_words(balises, 'balise')} met",
         "Trains (vehicle file)": ", ".join(f"{name} {count}" for name, count in trains.iter_rows()),
         "Receivers": f"{', '.join(solutions)} at {', '.join(number(rate) for rate in rates)} Hz",
         "Files": "the last of all columns of Table 1 has each run's digest of log and site",
@@ -135,6 +137,7 @@ def _facts(campaign: Campaign, solutions: list[str]) -> list[tuple[str, str]]:
 
 
 def _runs_table(campaign: Campaign) -> str:
+    """HTML of the table of all runs, the worst first."""
     runs = (
         known_counts(campaign.runs)
         .with_columns(
@@ -147,9 +150,10 @@ def _runs_table(campaign: Campaign) -> str:
             nulls_last=True,
         )
     )
-    why = _whys(campaign)
+    why = _why_words(campaign)
 
-    def digest(row: Row) -> Cell:
+    def digest_cell(row: Row) -> Cell:
+        """A digest, shortened."""
         whole = row["input_digest"]
         short = whole[:12]
         return Cell(short, whole, f'<span title="{escape(whole)}">{escape(short)}</span>')
@@ -159,31 +163,31 @@ def _runs_table(campaign: Campaign) -> str:
         "run_id": lambda row: Cell(
             row["run_id"], row["run_id"], link(campaign.hrefs.get(row["run_id"], ""), row["run_id"], data_run="")
         ),
-        "balises_found": _accepted,
-        "notes": _notes,
+        "balises_found": _accepted_cell,
+        "notes": _notes_cell,
         "why": lambda row: Cell(text := why[row["run_id"], row["solution"]], text),
         "status": lambda row: Cell(row["status"], row["status"], badge(f"reading {row['status']}", row["status"])),
-        "input_digest": digest,
+        "input_digest": digest_cell,
     }
     caption = "Runs, the worst first"
     return frame_table("table-runs", caption, runs, RUN_COLUMNS, CampaignRuns, special)
 
 
-def _accepted(row: Row) -> Cell:
+def _accepted_cell(row: Row) -> Cell:
     """How many of the balises on the path were accepted."""
     found = row["balises_found"]
     return Cell(UNKNOWN) if found is None else Cell("".join(accepted_words(row)), float(found))
 
 
-def _notes(row: Row) -> Cell:
+def _notes_cell(row: Row) -> Cell:
     """The notes, folded: some are longer than all around them."""
     notes = notes_apart(row["notes"])
     items = "".join(f"<p>{escape(note)}</p>" for note in notes)
-    summary = plural(len(notes), "note")
+    summary = count_words(len(notes), "note")
     return Cell(summary, float(len(notes)), f"<details><summary>{summary}</summary>{items}</details>" if notes else "")
 
 
-def _whys(campaign: Campaign) -> dict[tuple[str, str], str]:
+def _why_words(campaign: Campaign) -> dict[tuple[str, str], str]:
     """What is wrong with each run and solution, in a few words; nothing where it is safe."""
     faults = campaign.hazards.partition_by("run_id", as_dict=True)
     offers = campaign.passages.filter(pl.col("hazard_id").is_not_null()).partition_by("run_id", as_dict=True)
@@ -196,8 +200,11 @@ def _whys(campaign: Campaign) -> dict[tuple[str, str], str]:
     return whys
 
 
-def _solution(key: str, name: str, campaign: Campaign, several: bool) -> str:
-    rates, levels, balises = (_only(campaign.derived[table], name) for table in ("figures", "detection", "balises"))
+def _solution_section(key: str, name: str, campaign: Campaign, several: bool) -> str:
+    """HTML of balises, hazards and figures of one solution."""
+    rates, levels, balises = (
+        _rows_of_solution(campaign.derived[table], name) for table in ("figures", "detection", "balises")
+    )
     statements = "".join(f"<p>{escape(text)}</p>" for text in (*plain_statements(rates), *level_statements(levels)))
     note = "<p>Rates count all that this campaign holds, injected faults included. Bounds: exact, 95 %, two-sided.</p>"
     rows = rates.drop("solution").iter_rows(named=True)
@@ -206,12 +213,12 @@ def _solution(key: str, name: str, campaign: Campaign, several: bool) -> str:
         key,
         f"Solution {name}" if several else "Balises, hazards, figures",
         balise_table(f"table-balises-{key}", "Balises over all runs, the worst first", lost_shares(balises)),
-        _hazards_table(key, _only(campaign.hazards, name), campaign),
+        _hazards_table(key, _rows_of_solution(campaign.hazards, name), campaign),
         *(figure(f"{key}-{plot}", heading, explanation) for plot, heading, explanation in plots_of("campaign")),
         statements,
         frame_table(f"table-levels-{key}", ALLOWED, levels, _LEVEL_COLUMNS, CampaignDetection),
         note,
-        *(figures(f"table-figures-{key}", caption, row, CampaignFigures) for row in rows),
+        *(figures_table(f"table-figures-{key}", caption, row, CampaignFigures) for row in rows),
     )
 
 
@@ -219,10 +226,11 @@ def _pages_on_demand(campaign: Campaign) -> str:
     """How to get the pages that are not there."""
     without = campaign.runs.filter(~pl.col("run_id").is_in(list(campaign.hrefs)))["run_id"].n_unique()
     command = "<code>balise report OUT --run RUN</code> (in a project without OUT)"
-    return f"<p>{plural(without, 'run')} without a page: {command} writes one.</p>" if without else ""
+    return f"<p>{count_words(without, 'run')} without a page: {command} writes one.</p>" if without else ""
 
 
 def _hazards_table(key: str, hazards: pl.DataFrame, campaign: Campaign) -> str:
+    """HTML of the hazards of one solution, the worst first."""
     special = {
         "run_id": lambda row: hazard_cell(
             row, f"{row['run_id']} {row['hazard_id']}", campaign.hrefs.get(row["run_id"], ""), data_hazard=""
@@ -246,7 +254,10 @@ def _map_in_doubt(places: pl.DataFrame) -> str:
 
 
 def _solution_data(name: str, campaign: Campaign, made: Made) -> Json:
-    runs, hazards, passages = (_only(frame, name) for frame in (campaign.runs, campaign.hazards, campaign.passages))
+    """What the drawings of one solution show."""
+    runs, hazards, passages = (
+        _rows_of_solution(frame, name) for frame in (campaign.runs, campaign.hazards, campaign.passages)
+    )
     counts = Counter(hazards.select(pl.col("hazard").cast(pl.String), "within_budget").rows())
     return {
         # Within the budget, beyond it, not known.
@@ -255,23 +266,24 @@ def _solution_data(name: str, campaign: Campaign, made: Made) -> Json:
         "runs_with_truth": runs["evidence"].is_in(TRUTH).sum(),
         "hazards": hazards.height,
         "failures": int(runs["failures"].sum()),
-        "time_to_detect_s": _sorted(hazards.filter(pl.col("detected"))["time_to_detect_s"]),
-        "hazardous_s": _sorted(failures_of(runs)["hazardous_may_s"]),
-        "location": _location(passages),
-        "map": availability_map(_only(campaign.pieces, name), hazards, made.site),
+        "time_to_detect_s": _sorted_values(hazards.filter(pl.col("detected"))["time_to_detect_s"]),
+        "hazardous_s": _sorted_values(failures_table(runs)["hazardous_may_s"]),
+        "location": _location_counts(passages),
+        "map": availability_map(_rows_of_solution(campaign.pieces, name), hazards, made.site),
     }
 
 
-def _sorted(values: pl.Series) -> list[float]:
+def _sorted_values(values: pl.Series) -> list[float]:
+    """Known values in order, to the microsecond."""
     return [round(value, 6) for value in values.drop_nulls().sort().to_list()]
 
 
-def _location(passages: pl.DataFrame) -> Json:
+def _location_counts(passages: pl.DataFrame) -> Json:
     """Location errors of offers as counts per outcome and bin of 1 m up to 50 m, beyond in the last bins."""
     known = passages.filter(pl.col("location_error_m").is_not_null())
     counts = (
         known.group_by(
-            outcome=outcome(),
+            outcome=outcome_of_passage(),
             at=pl.col("location_error_m").floor().clip(-51, 50).cast(pl.Int64),
         )
         .len("count")
@@ -280,10 +292,11 @@ def _location(passages: pl.DataFrame) -> Json:
     return [list(row) for row in counts.iter_rows()]
 
 
-def _provenance(runs: pl.DataFrame, made: Made) -> str:
+def _provenance_section(runs: pl.DataFrame, made: Made) -> str:
+    """HTML of program, configuration and budget."""
     names = ("software", "contract", "config_digest")
     digests = pairs((name, ", ".join(runs[name].unique().sort().to_list())) for name in names)
     level = escape(made.config.hazards.service_level)
     allowed = number(made.config.budget_s, 4)
     budget = f"<p>A wrong position may be in use for {allowed} s (service level {level}).</p>"
-    return section("provenance", "Provenance", digests, budget, configuration(made))
+    return section("provenance", "Provenance", digests, budget, configuration_html(made))

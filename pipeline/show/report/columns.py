@@ -8,7 +8,7 @@ from typing import Any
 import dataframely as dy
 import polars as pl
 
-from pipeline.show.report.markup import UNKNOWN, Cell, cell, number, table
+from pipeline.show.report.markup import UNKNOWN, Cell, number, table, value_cell
 from pipeline.show.report.words import OPINIONS, TITLES, WORDS
 from pipeline.stages.run_row.bounds import bound_columns
 
@@ -40,22 +40,22 @@ def frame_table(
     special = special or {}
     shown = list(names) or _figure_names(frame.columns)
     bounds = bound_columns(frame.columns)
-    meanings = _meanings(contract)
+    meanings = _column_meanings(contract)
     rows = [
-        [special[name](row) if name in special else _cell(row, name, bounds.get(name)) for name in shown]
+        [special[name](row) if name in special else _value_cell(row, name, bounds.get(name)) for name in shown]
         for row in frame.iter_rows(named=True)
     ]
-    return table(identity, caption, [(title(name), meanings.get(name, "")) for name in shown], rows)
+    return table(identity, caption, [(column_title(name), meanings.get(name, "")) for name in shown], rows)
 
 
-def figures(identity: str, caption: str, row: Row, contract: type[dy.Schema]) -> str:
+def figures_table(identity: str, caption: str, row: Row, contract: type[dy.Schema]) -> str:
     """One row as a table downwards: the name of each column as in the data, its value with unit and bounds, and what
     it means.
     """
-    meanings = _meanings(contract)
+    meanings = _column_meanings(contract)
     bounds = bound_columns(row)
     rows = [
-        [Cell(name, name), Cell(_text(row, name, bounds.get(name))), Cell(meanings[name], meanings[name])]
+        [Cell(name, name), Cell(_value_text(row, name, bounds.get(name))), Cell(meanings[name], meanings[name])]
         for name in _figure_names(row)
     ]
     return table(identity, caption, [("figure", "column in the data"), ("value", ""), ("meaning", "")], rows)
@@ -67,57 +67,61 @@ def _figure_names(names: Collection[str]) -> list[str]:
     return [name for name in names if name not in bounds]
 
 
-def _meanings(contract: type[dy.Schema] | None) -> dict[str, str]:
+def _column_meanings(contract: type[dy.Schema] | None) -> dict[str, str]:
+    """Meanings of the columns of a contract."""
     columns = {} if contract is None else contract.columns()
     return {name: column.description or "" for name, column in columns.items()}
 
 
-def _parts(name: str) -> tuple[str, str]:
+def _split_unit(name: str) -> tuple[str, str]:
     """A column's name without its unit, and the ending that says the unit."""
     ending = next((ending for ending in _UNITS if name.endswith(ending)), "")
     return name.removesuffix(ending), ending
 
 
-def title(name: str) -> str:
+def column_title(name: str) -> str:
     """A column's title for people."""
     if name in TITLES:
         return TITLES[name]
-    stem, ending = _parts(name)
+    stem, ending = _split_unit(name)
     words = stem.replace("_", " ")
     return f"{words} [{_UNITS[ending]}]" if ending else words
 
 
-def _cell(row: Row, name: str, bounds: tuple[str, str] | None) -> Cell:
+def _value_cell(row: Row, name: str, bounds: tuple[str, str] | None) -> Cell:
+    """A value of a column as a cell, with its bounds."""
     value = row[name]
     if bounds:
-        return Cell(_bounded(value, row[bounds[0]], row[bounds[1]], UNKNOWN), value)
+        return Cell(_bounded_text(value, row[bounds[0]], row[bounds[1]], UNKNOWN), value)
     if isinstance(value, list) and len(value) > _MOST_NAMES:
         value = [*value[:_MOST_NAMES], f"and {len(value) - _MOST_NAMES} more"]
-    plain = cell(value, 4)
+    plain = value_cell(value, 4)
     if isinstance(value, str):
         opinion = name == "suspect"
         words = (OPINIONS if opinion else WORDS).get(value, value)
         return Cell(words, value, tone="" if opinion else _WORD_TONES.get(value, ""))
-    return Cell(plain.text, plain.order, tone=_tone(name, value))
+    return Cell(plain.text, plain.order, tone=_cell_tone(name, value))
 
 
-def _tone(name: str, value: object) -> str:
+def _cell_tone(name: str, value: object) -> str:
+    """Tone of a value: bad, in doubt, or none."""
     if name == "within_budget":
         return "bad" if value is False else ""
     return _TONES.get(name, "") if value else ""
 
 
-def _text(row: Row, name: str, bounds: tuple[str, str] | None) -> str:
+def _value_text(row: Row, name: str, bounds: tuple[str, str] | None) -> str:
+    """A value of a column with bounds and unit, as text."""
     value = row[name]
-    unit = _UNITS.get(_parts(name)[1], "")
+    unit = _UNITS.get(_split_unit(name)[1], "")
     if bounds:
-        text = _bounded(value, row[bounds[0]], row[bounds[1]], "not known")
+        text = _bounded_text(value, row[bounds[0]], row[bounds[1]], "not known")
     else:
-        text = "not known" if value is None else cell(value, 4).text
+        text = "not known" if value is None else value_cell(value, 4).text
     return text if text == "not known" else f"{text} {unit}".strip()
 
 
-def _bounded(value: float | None, low: float | None, high: float | None, unknown: str) -> str:
+def _bounded_text(value: float | None, low: float | None, high: float | None, unknown: str) -> str:
     """A figure with its 95 % bounds; `at least` where only the lower one is known."""
     if value is None:
         return unknown if low is None else f"at least {number(low)}"

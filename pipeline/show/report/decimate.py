@@ -82,7 +82,7 @@ class Band:
     end_ms: int
 
 
-def band(t_ms: Ints, codes: Ints, hold_ms: int, gap_code: int, pieces: int = 3000) -> Band:
+def state_band(t_ms: Ints, codes: Ints, hold_ms: int, gap_code: int, pieces: int = 3000) -> Band:
     """A state over time as pieces; `gap_code` fills what is longer than `hold_ms` after an epoch.
 
     Codes are ordered by how bad they are. Where there are too many pieces, neighbours are drawn together and
@@ -98,7 +98,7 @@ def band(t_ms: Ints, codes: Ints, hold_ms: int, gap_code: int, pieces: int = 300
     starts, states = _merge_equal(times[order], states[order])
     if len(starts) > pieces:
         edges = np.linspace(int(t_ms[0]), end_ms, pieces + 1).astype(np.int64)[:-1]
-        starts, states = _merge_equal(*_worst(starts, states, edges))
+        starts, states = _merge_equal(*_worst_by_bin(starts, states, edges))
     return Band(starts, states, end_ms)
 
 
@@ -108,7 +108,7 @@ def _merge_equal(starts: Ints, codes: Ints) -> tuple[Ints, Ints]:
     return starts[first], codes[first]
 
 
-def _worst(starts: Ints, codes: Ints, edges: Ints) -> tuple[Ints, Ints]:
+def _worst_by_bin(starts: Ints, codes: Ints, edges: Ints) -> tuple[Ints, Ints]:
     """Bins, each with the worst of the pieces that reach into it."""
     first = np.searchsorted(starts, edges, side="right") - 1
     last = np.append(np.searchsorted(starts, edges[1:], side="left"), len(starts))

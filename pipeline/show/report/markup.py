@@ -42,7 +42,7 @@ class Cell:
     tone: str = ""
 
 
-def cell(value: object, digits: int = 3) -> Cell:
+def value_cell(value: object, digits: int = 3) -> Cell:
     """A value as a person reads it; numbers and instants sort by themselves."""
     match value:
         case None:
@@ -93,8 +93,8 @@ def table(identity: str, caption: str, heads: Sequence[tuple[str, str]], rows: S
         return f'<p class="none">{escape(caption)}: none.</p>'
     numeric = [any(isinstance(item.order, float) for item in column) for column in zip(*rows, strict=True)]
     beyond = [number >= _SHOWN_COLUMNS for number in range(len(heads))]
-    body = "\n".join(f"<tr>{''.join(map(_td, row, numeric, beyond))}</tr>" for row in rows)
-    titles = "".join(map(_th, heads, numeric, beyond))
+    body = "\n".join(f"<tr>{''.join(map(_cell_html, row, numeric, beyond))}</tr>" for row in rows)
+    titles = "".join(map(_heading_html, heads, numeric, beyond))
     switch = f'<label class="all"><input type="checkbox"> all {len(heads)} columns</label>' if any(beyond) else ""
     return (
         f'<div class="columns">{switch}<div class="scroll" tabindex="0" role="region" aria-label="{escape(caption)}">'
@@ -149,34 +149,37 @@ def page(title: str, heading: str, body: str, data: str, script: str, foot: str)
 
     `title` and `foot` stand on each sheet of paper.
     """
-    shared = _text("report.css")
-    printed = _printed_pages(title, foot)
-    code = _code(script)
+    shared = _own_file("report.css")
+    printed = _print_css(title, foot)
+    code = _script_code(script)
+    styles = f"{_policy_digest(shared)} {_policy_digest(printed)}"
     policy = (
-        f"default-src 'none'; script-src {_digest(code)}; style-src {_digest(shared)} {_digest(printed)}; "
+        f"default-src 'none'; script-src {_policy_digest(code)}; style-src {styles}; "
         "img-src data:; base-uri 'none'; form-action 'none'"
     )
-    parts = {"heading": heading, "body": _numbered(body), "data": data, "code": code, "shared": shared}
-    return Template(_text("page.html")).substitute(parts, policy=policy, title=escape(title), printed=printed)
+    parts = {"heading": heading, "body": _number_captions(body), "data": data, "code": code, "shared": shared}
+    return Template(_own_file("page.html")).substitute(parts, policy=policy, title=escape(title), printed=printed)
 
 
 @cache
-def _text(name: str) -> str:
+def _own_file(name: str) -> str:
+    """Text of a file of this package."""
     return (files("pipeline.show.report") / name).read_text(encoding="utf-8")
 
 
 @cache
-def _code(script: str) -> str:
-    return "\n".join(_text(name) for name in (*_SHARED_SCRIPTS, script))
+def _script_code(script: str) -> str:
+    """The code of a page's script, with what all share."""
+    return "\n".join(_own_file(name) for name in (*_SHARED_SCRIPTS, script))
 
 
 @cache
-def _digest(content: str) -> str:
+def _policy_digest(content: str) -> str:
     """The source of the policy that allows this very script or style."""
     return f"'sha256-{base64.b64encode(hashlib.sha256(content.encode()).digest()).decode()}'"
 
 
-def _printed_pages(head: str, foot: str) -> str:
+def _print_css(head: str, foot: str) -> str:
     """What stands at the top and the bottom of each sheet of paper."""
     return (
         f"@page {{ @top-left {{ content: {_css_text(head)}; }} @bottom-left {{ content: {_css_text(foot)}; }}"
@@ -189,7 +192,7 @@ def _css_text(text: str) -> str:
     return '"' + re.sub(r"[^A-Za-z0-9 .,:]", lambda match: f"\\{ord(match[0]):x} ", text) + '"'
 
 
-def _numbered(body: str) -> str:
+def _number_captions(body: str) -> str:
     """Figures and tables with their numbers, in the order of the page."""
     for opening, word in (("<figcaption><h3>", "Figure"), ("<caption>", "Table")):
         first, *parts = body.split(opening)
@@ -197,41 +200,45 @@ def _numbered(body: str) -> str:
     return body
 
 
-def _th(head: tuple[str, str], numeric: bool, beyond: bool) -> str:
+def _heading_html(head: tuple[str, str], numeric: bool, beyond: bool) -> str:
+    """A heading of a table."""
     title, meaning = head
-    kind = _classes("number" * numeric, "more" * beyond)
+    kind = _class_attribute("number" * numeric, "more" * beyond)
     hint = f' title="{escape(meaning)}"' if meaning else ""
     return f'<th scope="col"{kind}{hint}>{escape(title)}</th>'
 
 
-def _td(item: Cell, numeric: bool, beyond: bool) -> str:
+def _cell_html(item: Cell, numeric: bool, beyond: bool) -> str:
+    """A cell of a table."""
     wide = not numeric and len(item.text) > _LONG
-    classes = _classes("number" * numeric, "long" * wide, item.tone, "more" * beyond)
+    classes = _class_attribute("number" * numeric, "long" * wide, item.tone, "more" * beyond)
     content = escape(item.text) if item.html is None else item.html
-    return f"<td{_sort_key(item.order)}{classes}>{content}</td>"
+    return f"<td{_sort_attribute(item.order)}{classes}>{content}</td>"
 
 
-def _sort_key(order: float | str | None) -> str:
+def _sort_attribute(order: float | str | None) -> str:
+    """The attribute that a cell is sorted by."""
     if order is None:
         return ""
     key = repr(order) if isinstance(order, float) else order
     return f' data-order="{escape(key)}"'
 
 
-def _classes(*names: str) -> str:
+def _class_attribute(*names: str) -> str:
+    """The attribute of classes; nothing without any."""
     given = " ".join(name for name in names if name)
     return f' class="{given}"' if given else ""
 
 
-def packed(values: npt.ArrayLike, kind: str) -> dict[str, str]:
+def pack_numbers(values: npt.ArrayLike, kind: str) -> dict[str, str]:
     """Little-endian numbers as base64; `kind` is `f4`, `u4` or `u1`. NaN stands for not known."""
     array = np.asarray(values).astype(f"<{kind}")
     return {"kind": kind, "data": base64.b64encode(array.tobytes()).decode("ascii")}
 
 
-def packed_line(name: str, x: npt.ArrayLike, y: npt.ArrayLike) -> Json:
+def pack_line(name: str, x: npt.ArrayLike, y: npt.ArrayLike) -> Json:
     """A named line of a drawing."""
-    return {"name": name, "x": packed(x, "f4"), "y": packed(y, "f4")}
+    return {"name": name, "x": pack_numbers(x, "f4"), "y": pack_numbers(y, "f4")}
 
 
 def script_json(value: Json) -> str:

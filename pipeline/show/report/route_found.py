@@ -11,7 +11,7 @@ from pipeline.results.places import stretches_of
 from pipeline.results.store import file_name
 from pipeline.show.report.columns import frame_table
 from pipeline.show.report.markup import link, section
-from pipeline.show.report.words import some_of
+from pipeline.show.report.words import first_names
 from pipeline.stages.epochs.clock import least_belief
 from schemas.stages import ONE_TRACK_LEFT
 
@@ -70,7 +70,7 @@ def route_section(identity: str, run_id: str, epochs: pl.DataFrame) -> str:
     if route is None:
         return section(identity, "Route found", f"<p>{_TURNED}</p>")
     doubtful = route.filter("doubtful")["netelement_id"].to_list()
-    doubt = f"In doubt: {some_of(doubtful)}." if doubtful else "No stretch is in doubt."
+    doubt = f"In doubt: {first_names(doubtful)}." if doubtful else "No stretch is in doubt."
     href = f"data:text/csv;base64,{base64.b64encode(route.write_csv().encode()).decode()}"
     download = link(href, "route as csv", download=f"{file_name(run_id)}.csv")
     shown = route.select("doubtful", pl.exclude("doubtful"))

@@ -12,10 +12,10 @@ import polars as pl
 from pipeline.results.figures.campaign_tables import campaign_balises, with_truth
 from pipeline.results.figures.head import known_counts
 from pipeline.results.places import origin_of
-from pipeline.show.report.balises import architectures_section, balise_table, lost_shares, outcome
-from pipeline.show.report.columns import Row, figures, frame_table
+from pipeline.show.report.balises import architectures_section, balise_table, lost_shares, outcome_of_passage
+from pipeline.show.report.columns import Row, figures_table, frame_table
 from pipeline.show.report.ground import plan_data
-from pipeline.show.report.headline import FILES, facts, file_table, run_headline, tile_figures
+from pipeline.show.report.headline import FILES, fact_rows, file_table, run_headline, tile_figures
 from pipeline.show.report.markup import (
     Cell,
     Json,
@@ -88,12 +88,12 @@ def run_page(
     """
     rows = list(tables.runs.iter_rows(named=True))
     names = [row["solution"] for row in rows if row["solution"]]
-    parts = [_solution(f"s{number}", row, tables, made, len(rows) > 1) for number, row in enumerate(rows)]
+    parts = [_solution_sections(f"s{number}", row, tables, made, len(rows) > 1) for number, row in enumerate(rows)]
     side_by_side = architectures_section("architectures", architectures)
-    about = pairs(facts(rows, tables, metadata))
+    about = pairs(fact_rows(rows, tables, metadata))
     digests = pairs(sorted((name, value) for name, value in metadata.items() if not name.endswith(FILES)))
-    provenance = section("provenance", "Provenance", file_table(metadata), digests, configuration(made))
-    body = "\n".join([about, _contents(names), *parts, side_by_side, provenance])
+    provenance = section("provenance", "Provenance", file_table(metadata), digests, configuration_html(made))
+    body = "\n".join([about, _contents_html(names), *parts, side_by_side, provenance])
     hazards = made.config.hazards
     data = {
         "run": tables.run_id,
@@ -110,13 +110,13 @@ def run_page(
     }
     head = run_headline(rows, tables.hazards, tables.passages)
     verdict = verdict_head(head.word, head.worst, head.reasons, head.figures)
-    links = _navigation(neighbours)
+    links = _navigation_html(neighbours)
     heading = f"{verdict}{links}<h1>Run {escape(tables.run_id)}</h1>"
     foot = f"{rows[0]['software']}, log and site {rows[0]['input_digest'][:12]}"
     return page(f"{tables.run_id} · balise: {head.word}", heading, body, script_json(data), "run.js", foot)
 
 
-def _navigation(neighbours: Neighbours) -> str:
+def _navigation_html(neighbours: Neighbours) -> str:
     """Links to the campaign, and to the runs next to this one."""
     links = [link("../index.html", "Campaign", data_go="campaign")]
     for go, words, neighbour in (("previous", "← run", neighbours.before), ("next", "run →", neighbours.after)):
@@ -126,6 +126,7 @@ def _navigation(neighbours: Neighbours) -> str:
 
 
 def _solution_data(name: str, tables: RunTables, made: Made) -> Json:
+    """What the drawings of one solution show."""
     epochs, passages, hazards, alarms = (
         frame.filter(pl.col("solution") == name)
         for frame in (tables.epochs, tables.passages, tables.hazards, tables.alarms)
@@ -136,19 +137,22 @@ def _solution_data(name: str, tables: RunTables, made: Made) -> Json:
         "plan": plan_data(epochs, passages, made.site, moments_ns),
         "stanford": stanford_data(epochs, made.config.lds.ci_limit_m),
         "hazards": [
-            {"id": row["hazard_id"], "class": row["hazard"], **{name: _milliseconds(row[name]) for name in MOMENTS}}
+            {"id": row["hazard_id"], "class": row["hazard"], **{name: _as_milliseconds(row[name]) for name in MOMENTS}}
             for row in hazards.iter_rows(named=True)
         ],
-        "passages": [_passage_data(row) for row in passages.with_columns(outcome=outcome()).iter_rows(named=True)],
+        "passages": [
+            _passage_data(row) for row in passages.with_columns(outcome=outcome_of_passage()).iter_rows(named=True)
+        ],
     }
 
 
 def _passage_data(row: Row) -> Json:
+    """A passage as the drawings take it."""
     return {
         "id": row["balise_id"],
         "outcome": row["outcome"],
         "status": WORDS[row["status"]],
-        "t_ms": _milliseconds(row["t_offered"] or row["t_true"]),
+        "t_ms": _as_milliseconds(row["t_offered"] or row["t_true"]),
         "path_m": row["path_m"],
         "error_m": row["location_error_m"],
         "open_m": row["window_open_m"],
@@ -163,12 +167,13 @@ def hazard_cell(row: Row, title: str, page_href: str = "", **attributes: str) ->
     return Cell(title, title, link(href, title, **attributes), "" if row["detected"] else "bad")
 
 
-def _milliseconds(value: Any) -> float | None:
+def _as_milliseconds(value: Any) -> float | None:
     """An instant as the page's scripts take it."""
     return None if value is None else round(value.timestamp() * 1000.0, 3)
 
 
-def _contents(names: list[str]) -> str:
+def _contents_html(names: list[str]) -> str:
+    """HTML of the contents of a page, with the choice of solution and the tools of the drawings."""
     buttons = "".join(
         f'<button type="button" data-solution="{escape(name)}" aria-pressed="false">{escape(name)}</button>'
         for name in names
@@ -189,7 +194,7 @@ def _contents(names: list[str]) -> str:
     )
 
 
-def _solution(key: str, row: Row, tables: RunTables, made: Made, several: bool) -> str:
+def _solution_sections(key: str, row: Row, tables: RunTables, made: Made, several: bool) -> str:
     """All sections of one solution; of one that failed what reading and matching found out."""
     name = row["solution"]
     texts = [text for text in (row["error"], *notes_apart(row["notes"])) if text]
@@ -207,37 +212,53 @@ def _solution(key: str, row: Row, tables: RunTables, made: Made, several: bool) 
     balises = lost_shares(campaign_balises(with_truth(*named)))
     levels = pl.DataFrame({name: row[column] or [] for name, column in LEVEL_LISTS.items()})
 
-    def part(part_name: str, title: str, *content: str) -> str:
+    def section_of_solution(part_name: str, title: str, *content: str) -> str:
+        """A section of this solution."""
         return section(f"{part_name}-{key}", title, *content)
 
-    def rows(part_name: str, caption: str, frame: pl.DataFrame, *given: Any) -> str:
+    def table_of_solution(part_name: str, caption: str, frame: pl.DataFrame, *given: Any) -> str:
+        """A table of this solution."""
         return frame_table(f"table-{part_name}-{key}", caption, frame, *given)
 
     in_order = "Passages of balises, in order of time"
     shown = tiles(tile_figures(known, balises))
     parts = [
-        part("figures", f"Summary of {name}" if several else "Summary", shown, notes),
-        part("hazards", "Hazards", _hazards(key, row, hazards)),
-        part("balises", "Balises", balise_table(f"table-balises-{key}", "Balises, the worst first", balises)),
-        part("drawings", "Drawings", *(figure(f"{key}-{plot}", *text) for plot, *text in plots_of("run"))),
-        part("passages", "Passages", rows("passages", in_order, passages, _PASSAGES, Passages, {"status": _status})),
-        part("levels", "Service levels", rows("levels", ALLOWED, levels, (), CampaignLevels)),
-        part("alarms", "Alarms", rows("alarms", "Alarm episodes", alarms, _ALARMS, Alarms)),
+        section_of_solution("figures", f"Summary of {name}" if several else "Summary", shown, notes),
+        section_of_solution("hazards", "Hazards", _hazards_html(key, row, hazards)),
+        section_of_solution(
+            "balises", "Balises", balise_table(f"table-balises-{key}", "Balises, the worst first", balises)
+        ),
+        section_of_solution(
+            "drawings", "Drawings", *(figure(f"{key}-{plot}", *text) for plot, *text in plots_of("run"))
+        ),
+        section_of_solution(
+            "passages",
+            "Passages",
+            table_of_solution("passages", in_order, passages, _PASSAGES, Passages, {"status": _status_cell}),
+        ),
+        section_of_solution(
+            "levels", "Service levels", table_of_solution("levels", ALLOWED, levels, (), CampaignLevels)
+        ),
+        section_of_solution("alarms", "Alarms", table_of_solution("alarms", "Alarm episodes", alarms, _ALARMS, Alarms)),
         route_section(f"route-{key}", tables.run_id, epochs),
-        part("all", "All figures", figures(f"table-all-{key}", "All figures of the run", known, Runs)),
+        section_of_solution(
+            "all", "All figures", figures_table(f"table-all-{key}", "All figures of the run", known, Runs)
+        ),
     ]
     return f'<div class="solution" id="{key}" data-solution="{escape(name)}">' + "\n".join(parts) + "</div>"
 
 
-def _status(row: Row) -> Cell:
+def _status_cell(row: Row) -> Cell:
+    """The status of a passage as a cell."""
     word = WORDS[row["status"]]
     return Cell(word, word, tone="" if row["status"] == "accepted" else "lost")
 
 
-def _hazards(key: str, run: Row, hazards: pl.DataFrame) -> str:
+def _hazards_html(key: str, run: Row, hazards: pl.DataFrame) -> str:
+    """HTML of the hazards of a run, or what it means that there are none."""
     if hazards.height:
         caption = "Hazards; a link zooms every drawing to its hazard"
-        return frame_table(f"table-hazards-{key}", caption, hazards, _HAZARDS, Hazards, {"hazard_id": _hazard_name})
+        return frame_table(f"table-hazards-{key}", caption, hazards, _HAZARDS, Hazards, {"hazard_id": _hazard_link})
     if run["evidence"] is None:
         return '<p class="notice partial">No hazard was found, but there was nothing to judge the positions by.</p>'
     if run["evidence"] not in TRUTH:
@@ -250,11 +271,12 @@ def _hazards(key: str, run: Row, hazards: pl.DataFrame) -> str:
     return f'<p class="none">No hazard was found, judged by {JUDGES[run["evidence"]]}; {left}.</p>'
 
 
-def _hazard_name(row: Row) -> Cell:
+def _hazard_link(row: Row) -> Cell:
+    """A link to a hazard in the drawings."""
     return hazard_cell(row, f"{row['hazard_id']} {row['hazard']}", data_hazard=str(row["hazard_id"]))
 
 
-def configuration(made: Made) -> str:
+def configuration_html(made: Made) -> str:
     """The resolved configuration, folded."""
     if made.config_text is None:
         return '<p class="notice partial">The result holds no config.toml: limits are the defaults.</p>'

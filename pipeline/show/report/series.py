@@ -7,8 +7,8 @@ from collections.abc import Collection, Sequence
 import numpy as np
 import polars as pl
 
-from pipeline.show.report.decimate import WHOLE_SERIES, Band, band, detail_rows, kept_rows
-from pipeline.show.report.markup import Json, packed
+from pipeline.show.report.decimate import WHOLE_SERIES, Band, detail_rows, kept_rows, state_band
+from pipeline.show.report.markup import Json, pack_numbers
 from pipeline.stages.epochs.clock import gap_limit_s, nominal_period_s
 from schemas.arrays import Bools, Floats, Ints, floats
 from schemas.enums import Judgement, LdsMode, LdsState, MonitorState
@@ -48,14 +48,16 @@ def time_data(epochs: pl.DataFrame, moments_ns: Ints, gap_reset_s: float) -> Jso
     shown_ms = np.insert(t_ms, gaps, t_ms[gaps - 1] + hold_ms)
     whole = detail_rows(shown_ms * 1_000_000, moments_ns - t0_ms * 1_000_000)
     columns = {name: floats(epochs, name) for name in SERIES} | _ratios(epochs)
-    columns["residual_m"] = _residual(epochs)
+    columns["residual_m"] = _odometer_residual_m(epochs)
     known = {name: values for name, values in columns.items() if np.isfinite(values).any()}
     return {
         "t0_ms": t0_ms,
         "t1_ms": int(t_ns[-1] // 1_000_000),
-        "t": packed(shown_ms, "u4") if len(shown_ms) <= WHOLE_SERIES else None,
-        "series": {name: _series(shown_ms, np.insert(values, gaps, np.nan), whole) for name, values in known.items()},
-        "bands": [_band(*row, t_ms, hold_ms) for row in _states(epochs)],
+        "t": pack_numbers(shown_ms, "u4") if len(shown_ms) <= WHOLE_SERIES else None,
+        "series": {
+            name: _thin_series(shown_ms, np.insert(values, gaps, np.nan), whole) for name, values in known.items()
+        },
+        "bands": [_band_data(*row, t_ms, hold_ms) for row in _state_series(epochs)],
         "silent": _never_evaluated(epochs, known),
     }
 
@@ -100,38 +102,40 @@ def _ratios(epochs: pl.DataFrame) -> dict[str, Floats]:
     return ratios
 
 
-def _residual(epochs: pl.DataFrame) -> Floats:
+def _odometer_residual_m(epochs: pl.DataFrame) -> Floats:
     """GNSS minus odometer along the path, from where both are first known [m]."""
     both = floats(epochs, "path_m") - floats(epochs, "odometer_m")
     known = np.flatnonzero(np.isfinite(both))
     return both - both[known[0]] if len(known) else both
 
 
-def _series(t_ms: Ints, values: Floats, whole: Bools) -> Json:
+def _thin_series(t_ms: Ints, values: Floats, whole: Bools) -> Json:
     """A series, thinned out if it is long."""
     if len(values) <= WHOLE_SERIES:
-        return {"y": packed(values, "f4")}  # at every time in `t`
+        return {"y": pack_numbers(values, "f4")}  # at every time in `t`
     rows = kept_rows(values, whole)
-    return {"x": packed(t_ms[rows], "u4"), "y": packed(values[rows], "f4")}
+    return {"x": pack_numbers(t_ms[rows], "u4"), "y": pack_numbers(values[rows], "f4")}
 
 
-def _states(epochs: pl.DataFrame) -> list[tuple[str, str, Sequence[str], Ints]]:
+def _state_series(epochs: pl.DataFrame) -> list[tuple[str, str, Sequence[str], Ints]]:
     """Name, group and states from harmless to bad, and the code of each epoch."""
     modes = (NO_EPOCH, LdsMode.LINKED, LdsMode.INITIALISING, LdsMode.ODOMETRY, LdsMode.FAIL_SAFE)
     states = (NO_EPOCH, LdsState.P0, UNKNOWN, LdsState.P3, LdsState.P2, LdsState.P1)
     judgements = (NO_EPOCH, Judgement.RIGHT, Judgement.UNKNOWN, Judgement.WRONG)
     rows: list[tuple[str, str, Sequence[str], Ints]] = [
-        ("LDS mode", "lds", modes, _codes(epochs["lds_mode"], modes)),
-        ("LDS state", "lds", states, _codes(epochs["lds_state"], states)),
-        ("judgement", "lds", judgements, _codes(epochs["judgement"], judgements)),
+        ("LDS mode", "lds", modes, _state_codes(epochs["lds_mode"], modes)),
+        ("LDS state", "lds", states, _state_codes(epochs["lds_state"], states)),
+        ("judgement", "lds", judgements, _state_codes(epochs["judgement"], judgements)),
         ("TVB", "lds", (NO_EPOCH, "TVB", "no TVB"), 2 - epochs["tvb"].cast(pl.Int64).to_numpy()),
         ("alarm", "lds", (NO_EPOCH, "no alarm", "alarm"), 1 + epochs["alarm"].cast(pl.Int64).to_numpy()),
     ]
-    rows += [(name, "monitors", MONITOR_CODES, _codes(epochs[f"{name}_state"], MONITOR_CODES)) for name in MONITORS]
+    rows += [
+        (name, "monitors", MONITOR_CODES, _state_codes(epochs[f"{name}_state"], MONITOR_CODES)) for name in MONITORS
+    ]
     return rows
 
 
-def _codes(states: pl.Series, order: Sequence[str]) -> Ints:
+def _state_codes(states: pl.Series, order: Sequence[str]) -> Ints:
     """States as numbers."""
     names = [str(name) for name in order]
     codes = pl.Series(range(len(names)), dtype=pl.Int64)
@@ -139,15 +143,15 @@ def _codes(states: pl.Series, order: Sequence[str]) -> Ints:
     return known.replace_strict(pl.Series(names), codes, return_dtype=pl.Int64).to_numpy()
 
 
-def _band(name: str, group: str, states: Sequence[str], codes: Ints, t_ms: Ints, hold_ms: int) -> Json:
+def _band_data(name: str, group: str, states: Sequence[str], codes: Ints, t_ms: Ints, hold_ms: int) -> Json:
     """A band of states over time."""
-    pieces: Band = band(t_ms, codes, hold_ms, gap_code=0)
+    pieces: Band = state_band(t_ms, codes, hold_ms, gap_code=0)
     return {
         "name": name,
         "group": group,
         "states": [str(state) for state in states],
-        "starts": packed(pieces.starts_ms, "u4"),
-        "codes": packed(pieces.codes, "u1"),
+        "starts": pack_numbers(pieces.starts_ms, "u4"),
+        "codes": pack_numbers(pieces.codes, "u1"),
         "end_ms": pieces.end_ms,
     }
 

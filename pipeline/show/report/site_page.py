@@ -11,7 +11,7 @@ from pipeline.read.site.describe import elements_table
 from pipeline.results.places import element_lines_m, ground_of, origin_of, plane_m
 from pipeline.show.inspection import findings_table
 from pipeline.show.report.columns import frame_table
-from pipeline.show.report.markup import Json, figure, packed_line, page, script_json, section, tiles
+from pipeline.show.report.markup import Json, figure, pack_line, page, script_json, section, tiles
 from schemas.arrays import floats
 from schemas.inputs import Balises
 from schemas.run import Site
@@ -44,12 +44,13 @@ def site_page(name: str, site: Site) -> str:
     )
     heading = f"<h1>Site {escape(name)}</h1>"
     # Metres east and north of the first point.
-    elements_m = [packed_line(*line) for line in element_lines_m(site)]
-    plan = {"origin": origin_of(site), "elements": elements_m, "balises": _marks(site)}
+    elements_m = [pack_line(*line) for line in element_lines_m(site)]
+    plan = {"origin": origin_of(site), "elements": elements_m, "balises": _balise_marks(site)}
     return page(f"Site {name}", heading, body, script_json(plan), "site.js", SOFTWARE)
 
 
-def _marks(site: Site) -> list[Json]:
+def _balise_marks(site: Site) -> list[Json]:
+    """Balises with their places in the plan."""
     if site.balises is None:
         return []
     on_track = site.balises.filter(pl.col("netelement_id").is_in(site.track["netelement_id"].unique().to_list()))

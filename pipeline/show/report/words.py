@@ -16,12 +16,12 @@ def plots_of(page: str) -> list[tuple[str, str, str]]:
     return [(name, plot["title"], plot["text"]) for name, plot in words.WORDS["plots"][page].items()]
 
 
-def plural(count: int, singular: str) -> str:
+def count_words(count: int, singular: str) -> str:
     """`1 balise`, `3 balises`."""
     return f"{count} {singular if count == 1 else singular + 's'}"
 
 
-def some_of(names: Sequence[str], most: int = 8) -> str:
+def first_names(names: Sequence[str], most: int = 8) -> str:
     """The first of many names, and how many more there are."""
     more = f" and {len(names) - most} more" if len(names) > most else ""
     return ", ".join(names[:most]) + more

@@ -26,17 +26,17 @@ from pipeline.results.store import (
     read_run,
     tables_of,
 )
-from pipeline.results.workers import mapped, with_progress
+from pipeline.results.workers import map_in_processes, with_progress
 from pipeline.show.report.against_page import against_page
 from pipeline.show.report.campaign_page import Campaign, campaign_page
-from pipeline.show.report.ground import PIECE_COLUMNS, availability_pieces, together
+from pipeline.show.report.ground import PIECE_COLUMNS, availability_pieces, combine_pieces
 from pipeline.show.report.run_page import Made, Neighbours, run_page
 from pipeline.storage import files
 from pipeline.storage.address import Address
 from pipeline.storage.parquet import parquet_bytes, read_parquet
 from pipeline.studies.safety.assessment import compare_architectures
 from pipeline.studies.safety.side_by_side import side_by_side
-from pipeline.studies.safety.tally import COUNTS, added
+from pipeline.studies.safety.tally import COUNTS, add_counts
 from schemas.config import Configuration, to_toml
 from schemas.errors import UsageError
 from schemas.frozen import frozen
@@ -79,14 +79,14 @@ def write_report(out: Path, site: Site | None = None, jobs: int = 0, most_pages:
         Paths of the pages, the index first.
     """
     markers = _markers(out)
-    pages = _pages(out, site, markers, most_pages)
-    rows = _known(out, pages)
+    pages = _possible_pages(out, site, markers, most_pages)
+    rows = _current_rows(out, pages)
     left = [page for page in pages if page.run not in rows] if len(pages) <= most_pages else []
     # Starting a process takes as long as some pages.
     jobs = jobs or min(os.cpu_count() or 1, 1 + len(left) // 20)
-    rows |= zip((page.run for page in left), mapped(_written, left, jobs), strict=True)
+    rows |= zip((page.run for page in left), map_in_processes(_write_run_page, left, jobs), strict=True)
     there = [page for page in pages if page.run in rows]
-    _keep(out, markers, [rows[page.run] for page in there])
+    _keep_rows(out, markers, [rows[page.run] for page in there])
     folder = out / "report" / "runs"
     for name in set(files.list_dir(folder) if folder.exists() else []) - {page.path.name for page in there}:
         if name.endswith(".html"):
@@ -96,9 +96,9 @@ def write_report(out: Path, site: Site | None = None, jobs: int = 0, most_pages:
     hrefs = {page.run: f"runs/{quote(page.path.name)}" for page in there}
     index = out / "report" / "index.html"
     made = pages[0].made
-    of_runs = _of_pages(list(rows.values())) if len(there) == len(pages) else _of_tables(out, made)
-    storage.write_bytes(index, campaign_page(_campaign(out, made, hrefs, *of_runs), made).encode())
-    return _noted(out, [index, *(page.path for page in there)])
+    of_runs = _parts_of_pages(list(rows.values())) if len(there) == len(pages) else _parts_of_tables(out, made)
+    storage.write_bytes(index, campaign_page(_campaign_tables(out, made, hrefs, *of_runs), made).encode())
+    return _note_pages(out, [index, *(page.path for page in there)])
 
 
 def write_page(out: Path, run_id: str, site: Site | None = None, most_pages: int = MOST_PAGES) -> Path:
@@ -117,13 +117,13 @@ def write_page(out: Path, run_id: str, site: Site | None = None, most_pages: int
         UsageError: the run is not in the result.
     """
     markers = _markers(out)
-    pages = {page.run: page for page in _pages(out, site, markers, most_pages)}
+    pages = {page.run: page for page in _possible_pages(out, site, markers, most_pages)}
     if run_id not in pages:
         raise UsageError(f"has no run {run_id!r}", place=str(out), found=", ".join([*pages][:10]))
-    known = _known(out, list(pages.values()))
-    known[run_id] = _written(pages[run_id])
-    _keep(out, markers, [known[run] for run in pages if run in known])
-    _noted(out, [out / "report" / name for name in storage.files_below(out / "report")])
+    known = _current_rows(out, list(pages.values()))
+    known[run_id] = _write_run_page(pages[run_id])
+    _keep_rows(out, markers, [known[run] for run in pages if run in known])
+    _note_pages(out, [out / "report" / name for name in storage.files_below(out / "report")])
     return pages[run_id].path
 
 
@@ -139,11 +139,11 @@ def write_against(out: Path, other: Address) -> Path:
     """
     place = out / "report" / AGAINST
     storage.write_bytes(place, against_page(out, other).encode())
-    _noted(out, [out / "report" / name for name in storage.files_below(out / "report")])
+    _note_pages(out, [out / "report" / name for name in storage.files_below(out / "report")])
     return place
 
 
-def _pages(out: Path, site: Site | None, markers: Mapping[str, str], most_pages: int) -> list[_Page]:
+def _possible_pages(out: Path, site: Site | None, markers: Mapping[str, str], most_pages: int) -> list[_Page]:
     """The pages that there may be; of more than `most_pages` none leads to its neighbours, which may have none."""
     names = {run: page_name(run) for run in complete_runs(out)}
     config = read_config(out)
@@ -162,7 +162,8 @@ def _pages(out: Path, site: Site | None, markers: Mapping[str, str], most_pages:
     ]
 
 
-def _keep(out: Path, markers: Mapping[str, str], rows: Sequence[pl.DataFrame]) -> None:
+def _keep_rows(out: Path, markers: Mapping[str, str], rows: Sequence[pl.DataFrame]) -> None:
+    """Keep what the runs add to the campaign's page, unless they changed meanwhile."""
     # Runs that changed while they were read must not pass for what was read.
     if rows and markers == _markers(out):
         catalogue.keep(out, _KEPT, software_digest(), parquet_bytes(pl.concat(rows)))
@@ -173,7 +174,7 @@ def _markers(out: Path) -> dict[str, str]:
     return {marker.run_id: marker.sha256 for marker in store.markers(out)}
 
 
-def _noted(out: Path, pages: list[Path]) -> list[Path]:
+def _note_pages(out: Path, pages: list[Path]) -> list[Path]:
     """The pages, once the manifest names them."""
     contents = {page.relative_to(out / "report").as_posix(): storage.content_of(page) for page in pages}
     note_pages(out, {name: content for name, content in contents.items() if content is not None})
@@ -205,9 +206,9 @@ def _with_digest(page: _Page, marker: str) -> _Page:
     return replace(page, made_of=hashlib.sha256(text.encode()).hexdigest())
 
 
-def _known(out: Path, pages: Sequence[_Page]) -> dict[str, pl.DataFrame]:
+def _current_rows(out: Path, pages: Sequence[_Page]) -> dict[str, pl.DataFrame]:
     """What is kept of the runs whose pages are there and would be the same again, a row each."""
-    content = catalogue.kept(out, _KEPT, software_digest())
+    content = catalogue.kept_content(out, _KEPT, software_digest())
     kept = [] if content is None else read_parquet(content).iter_slices(1)
     rows = {row["made_of"][0]: row for row in kept}
     candidates = ((page, rows.get(page.made_of)) for page in pages if page.made_of)
@@ -218,7 +219,7 @@ def _known(out: Path, pages: Sequence[_Page]) -> dict[str, pl.DataFrame]:
     }
 
 
-def _written(page: _Page) -> pl.DataFrame:
+def _write_run_page(page: _Page) -> pl.DataFrame:
     """Write the page; returns the row to keep of it."""
     metadata = completed_runs(page.out, [page.run])[page.run]
     check_site(page.made.site, metadata.get("site_digest"), page.run)
@@ -233,18 +234,20 @@ def _written(page: _Page) -> pl.DataFrame:
     )
 
 
-def _unlisted(rows: pl.DataFrame, name: str) -> pl.DataFrame:
+def _concat_column(rows: pl.DataFrame, name: str) -> pl.DataFrame:
     """What the runs add, one after the other."""
     return rows[name].explode().drop_nulls().struct.unnest()
 
 
-def _of_pages(rows: Sequence[pl.DataFrame]) -> tuple[pl.DataFrame, pl.DataFrame]:
+def _parts_of_pages(rows: Sequence[pl.DataFrame]) -> tuple[pl.DataFrame, pl.DataFrame]:
     """Pieces and architectures of all runs, where all of them have a page."""
     together_rows = pl.concat(rows)
-    return together(_unlisted(together_rows, "pieces")), added([_unlisted(together_rows, "tallies")])
+    return combine_pieces(_concat_column(together_rows, "pieces")), add_counts(
+        [_concat_column(together_rows, "tallies")]
+    )
 
 
-def _of_tables(out: Path, made: Made) -> tuple[pl.DataFrame, pl.DataFrame]:
+def _parts_of_tables(out: Path, made: Made) -> tuple[pl.DataFrame, pl.DataFrame]:
     """The same from the tables; the pieces may be longer, as those of many runs are counted at once."""
     names = complete_runs(out)
     for run, metadata in completed_runs(out).items():
@@ -254,12 +257,15 @@ def _of_tables(out: Path, made: Made) -> tuple[pl.DataFrame, pl.DataFrame]:
         availability_pieces(tables_of(out, "epochs", some, PIECE_COLUMNS).lazy()) for some in with_progress(portions)
     ]
     runs, hazards, alarms = (store.read_table(out, table).collect() for table in ("runs", "hazards", "alarms"))
-    return together(pl.concat(pieces)), added(compare_architectures(out, runs, hazards, alarms, made.config).values())
+    return combine_pieces(pl.concat(pieces)), add_counts(
+        compare_architectures(out, runs, hazards, alarms, made.config).values()
+    )
 
 
-def _campaign(
+def _campaign_tables(
     out: Path, made: Made, hrefs: dict[str, str], pieces: pl.DataFrame, architectures: pl.DataFrame
 ) -> Campaign:
+    """All that the campaign's page shows."""
     tables = store.small_tables(out)
     return Campaign(
         runs=tables["runs"],

@@ -11,13 +11,13 @@ from dataclasses import asdict, fields
 
 import numpy as np
 import polars as pl
-from schemas.monitors import ALL_MONITORS, AXES, SCALES
 from scipy.optimize import nnls
 
 from schemas.arrays import Floats
 from schemas.config import CalibrationConfig, Configuration
 from schemas.enums import MonitorState
 from schemas.frozen import frozen
+from schemas.monitors import ALL_MONITORS, AXES, SCALES
 
 # Numerics of the regression: bins of the same number of epochs. Half or twice as many change a simulated fit by less
 # than a fifth of its standard error.
@@ -56,14 +56,14 @@ def regress_sigmas(runs: Sequence[pl.DataFrame], factor: float, config: Calibrat
     fits = []
     least = -(-config.left_out_pieces // max(len(runs), 1))
     for monitor, axis in _AXIS_OF_BANK.items():
-        pieces = [piece for run in runs for piece in _pieces(run, monitor, axis, factor, least)]
+        pieces = [piece for run in runs for piece in _jackknife_pieces(run, monitor, axis, factor, least)]
         samples = np.concatenate(pieces) if pieces else np.zeros((0, 2))
         if len(samples) >= config.least_epochs:
             fits.append(_fit_with_errors(monitor, pieces, config))
     return fits
 
 
-def _pieces(run: pl.DataFrame, monitor: str, axis: str, factor: float, count: int) -> list[Floats]:
+def _jackknife_pieces(run: pl.DataFrame, monitor: str, axis: str, factor: float, count: int) -> list[Floats]:
     """Rows (sigma of the axis, value over predicted sigma), in so many pieces for the jackknife."""
     sigma = f"sigma_{axis}_m"
     chosen = run.filter(pl.col(f"{monitor}_state") != "not_evaluated").select(
@@ -76,10 +76,12 @@ def _pieces(run: pl.DataFrame, monitor: str, axis: str, factor: float, count: in
 def _fit_with_errors(monitor: str, pieces: list[Floats], config: CalibrationConfig) -> SigmaFit:
     """The fit of one monitor, with errors by leaving out each piece in turn (jackknife)."""
     count = len(pieces)
-    whole = _fit(np.concatenate(pieces), config)
+    whole = _fit_samples(np.concatenate(pieces), config)
     errors = np.full(3, np.nan)
     if count > 1:
-        without = np.array([_fit(np.concatenate(pieces[:left] + pieces[left + 1 :]), config) for left in range(count)])
+        without = np.array(
+            [_fit_samples(np.concatenate(pieces[:left] + pieces[left + 1 :]), config) for left in range(count)]
+        )
         errors = np.sqrt((count - 1) / count * ((without - without.mean(axis=0)) ** 2).sum(axis=0))
     figures = [figure for pair in zip(whole.tolist(), errors.tolist(), strict=True) for figure in pair]
     return SigmaFit(monitor, sum(len(piece) for piece in pieces), *figures)
@@ -90,7 +92,7 @@ def overall_ratio(ratios: Floats) -> float:
     return float(np.sqrt(np.mean(np.square(ratios))))
 
 
-def _fit(samples: Floats, config: CalibrationConfig) -> Floats:
+def _fit_samples(samples: Floats, config: CalibrationConfig) -> Floats:
     """Overall ratio, intercept [m] and slope from rows (sigma, ratio): weighted least squares over bins of sigma."""
     sigma = samples[:, 0]
     squares = samples[:, 1] ** 2
@@ -142,7 +144,7 @@ def worst_fit(fits: Sequence[SigmaFit]) -> SigmaFit | None:
     return max(fits, key=lambda fit: fit.ratio - 2.0 * float(np.nan_to_num(fit.ratio_error)), default=None)
 
 
-def beyond_noise(epochs: pl.DataFrame, factor: float) -> tuple[str, ...]:
+def monitors_beyond_noise(epochs: pl.DataFrame, factor: float) -> tuple[str, ...]:
     """Monitors of a run, replayed without any noise, that fail by more than its noise; `factor` is k_T.
 
     The raw monitor of an axis shows its noise and hardly a drift or step. So every monitor of the axis is held against
@@ -150,12 +152,14 @@ def beyond_noise(epochs: pl.DataFrame, factor: float) -> tuple[str, ...]:
     """
     failing: list[str] = []
     for axis in AXES:
-        shown = _ratios(epochs, f"{axis}_raw")
+        shown = _threshold_ratios(epochs, f"{axis}_raw")
         widened = max(1.0, overall_ratio((factor * shown).to_numpy())) if len(shown) else 1.0
-        failing += [name for scale in SCALES if (_ratios(epochs, name := f"{axis}_{scale}").abs() > widened).any()]
+        failing += [
+            name for scale in SCALES if (_threshold_ratios(epochs, name := f"{axis}_{scale}").abs() > widened).any()
+        ]
     return (*failing, *(name for name in _LINKING if (epochs[f"{name}_state"] == MonitorState.FAIL.value).any()))
 
 
-def _ratios(epochs: pl.DataFrame, monitor: str) -> pl.Series:
+def _threshold_ratios(epochs: pl.DataFrame, monitor: str) -> pl.Series:
     """Value over threshold where the monitor was evaluated."""
     return (epochs[f"{monitor}_value"] / epochs[f"{monitor}_threshold"]).drop_nulls()

@@ -51,14 +51,14 @@ def estimate_run(t_s: Floats, path_m: Floats, odometry: Odometry) -> RunEstimate
 
 
 @frozen
-class Pooled:
+class PooledFigure:
     """Of the next run of the vehicle."""
 
     value: float
     sigma: float
 
 
-def pooled(values: Floats, sigmas: Floats) -> Pooled:
+def pool_runs(values: Floats, sigmas: Floats) -> PooledFigure:
     """Runs together; the sigma includes their scatter: wheels wear and sensors drift.
 
     Args:
@@ -78,4 +78,4 @@ def pooled(values: Floats, sigmas: Floats) -> Pooled:
     between = max(0.0, (scatter - (values.size - 1)) / spare) if values.size > 1 else 0.0
     weight = 1.0 / (sigmas**2 + between)
     mean = float(weight @ values / weight.sum())
-    return Pooled(mean, float(np.sqrt(1.0 / weight.sum() + between)))
+    return PooledFigure(mean, float(np.sqrt(1.0 / weight.sum() + between)))

@@ -6,7 +6,7 @@ Touches files only to read them: results, profiles, `areas`.
 """
 
 from pipeline.studies.claim.areas import read_areas
-from pipeline.studies.claim.claim import claim, for_reading
+from pipeline.studies.claim.claim import assess_claim, rows_for_reading
 from pipeline.studies.claim.profile import load_profile
 
-__all__ = ["claim", "for_reading", "load_profile", "read_areas"]
+__all__ = ["assess_claim", "load_profile", "read_areas", "rows_for_reading"]

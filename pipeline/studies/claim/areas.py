@@ -55,14 +55,14 @@ def read_areas(path: Path | str, site: Site) -> pl.DataFrame | None:
     raw = load_table(present[0], read_bytes(join(path, present[0])), breaches)
     areas = None if raw is None else typed_table(raw, "areas", breaches)
     if areas is not None:
-        breaches += _breaches(present[0], areas, site)
+        breaches += _faults_of_areas(present[0], areas, site)
     if areas is None or breaches:
         remedy = "Mend what is named; `balise dictionary --table areas` lists the columns."
         raise SiteError(listed(breaches), place=shown(path), remedy=remedy)
     return Areas.validate(areas, cast=True)
 
 
-def _breaches(file: str, areas: pl.DataFrame, site: Site) -> list[str]:
+def _faults_of_areas(file: str, areas: pl.DataFrame, site: Site) -> list[str]:
     """What is wrong with a file of areas: unknown net elements, overlaps."""
     known = set(site.track["netelement_id"])
     ordered = areas.sort("netelement_id", "from_m", maintain_order=True)
@@ -86,7 +86,7 @@ def _breaches(file: str, areas: pl.DataFrame, site: Site) -> list[str]:
     return breaches
 
 
-def placed(areas: pl.DataFrame | None, netelement_id: pl.Series, measure_m: pl.Series) -> AreaPlaces:
+def areas_at(areas: pl.DataFrame | None, netelement_id: pl.Series, measure_m: pl.Series) -> AreaPlaces:
     """The area of each place; at the border of two that of the second."""
     size = len(netelement_id)
     if areas is None or areas.is_empty():

@@ -11,12 +11,12 @@ import polars as pl
 from pipeline.results import store
 from pipeline.results.workers import with_progress
 from pipeline.storage.address import Address
-from pipeline.studies.claim.front import front_of
+from pipeline.studies.claim.front import front_end_of
 from pipeline.studies.claim.profile import RequirementProfile
 from pipeline.studies.claim.requirements import ALL, ClaimJourney, Requirement, Tallies, requirements, tallies
-from pipeline.studies.claim.tally import Kind, Tally, drawn
-from pipeline.studies.reservations import failed_runs, runs_without_truth, sentences, several_settings
-from pipeline.studies.tally import S_PER_H, Compliance, distinct
+from pipeline.studies.claim.tally import Kind, Tally, random_share
+from pipeline.studies.reservations import failed_runs, reservation_sentences, runs_without_truth, several_settings
+from pipeline.studies.tally import S_PER_H, Compliance, without_repeated_journeys
 from schemas.config import Configuration
 from schemas.enums import NotShown, RunStatus
 from schemas.frozen import frozen
@@ -40,7 +40,7 @@ class Claim:
     notes: list[str]
 
 
-def claim(
+def assess_claim(
     out: Address,
     profile: RequirementProfile,
     site: Site | None = None,
@@ -68,17 +68,19 @@ def claim(
         store.check_site(site, metadata.get("site_digest"), run_id)
     runs = store.read_table(out, "runs").collect()
     done = runs.filter((pl.col("status").cast(pl.String) != RunStatus.FAILED.value) & pl.col("run_id").is_in(run_ids))
-    done, twice = distinct(done)
+    done, twice = without_repeated_journeys(done)
     by_solution: dict[str, Tallies] = defaultdict(dict)
     days: set[tuple[object, ...]] = set()
     # Which run of a day is its trial is drawn before an error is looked at, and apart from its instant.
-    for run in with_progress(sorted(done.iter_rows(named=True), key=lambda row: drawn(f"day\n{_name(row)}"))):
-        of_run = _tallies_of(out, run, config, profile, areas, ahead_m)
+    for run in with_progress(
+        sorted(done.iter_rows(named=True), key=lambda row: random_share(f"day\n{_trial_key(row)}"))
+    ):
+        of_run = _tallies_of_run(out, run, config, profile, areas, ahead_m)
         if profile.method.independent == "day" and run["t_start"] is not None:
             of_run = _once_a_day(of_run, (run["solution"], run["t_start"].date()), days)
-        _add(by_solution[run["solution"]], of_run)
+        _add_counts(by_solution[run["solution"]], of_run)
     outside_h = sum(counts["no_area", ALL].held_s for counts in by_solution.values()) / S_PER_H
-    notes = [*twice, *_notes(runs, outside_h, areas, ahead_m, profile)]
+    notes = [*twice, *_reader_notes(runs, outside_h, areas, ahead_m, profile)]
     return Claim(profile, claim_table(by_solution, profile), notes)
 
 
@@ -93,7 +95,7 @@ def _once_a_day(of_run: Tallies, day: tuple[object, ...], days: set[tuple[object
     return once
 
 
-def _tallies_of(
+def _tallies_of_run(
     out: Address,
     run: dict[str, Any],
     config: Configuration,
@@ -104,17 +106,17 @@ def _tallies_of(
     """What one run counts for each requirement and area."""
     of_run = (store.read_table(out, name, run["run_id"]).collect() for name in ("epochs", "passages"))
     epochs, passages = (frame.filter(pl.col("solution") == run["solution"]) for frame in of_run)
-    front = front_of(epochs, passages, run, config, profile.method, areas, ahead_m)
-    journey = ClaimJourney(_name(run), front, epochs, passages, profile)
-    return tallies(journey) | {("no_area", ALL): journey.outside()}
+    front = front_end_of(epochs, passages, run, config, profile.method, areas, ahead_m)
+    journey = ClaimJourney(_trial_key(run), front, epochs, passages, profile)
+    return tallies(journey) | {("no_area", ALL): journey.tally_outside()}
 
 
-def _name(run: dict[str, Any]) -> str:
+def _trial_key(run: dict[str, Any]) -> str:
     """What draws the trial of a run."""
     return f"{run['run_id']}\n{run['solution']}"
 
 
-def _add(sums: Tallies, more: Tallies) -> None:
+def _add_counts(sums: Tallies, more: Tallies) -> None:
     """Add counts to the sums, in place."""
     for key, counts in more.items():
         sums[key] = sums.get(key, Tally()) + counts
@@ -123,16 +125,16 @@ def _add(sums: Tallies, more: Tallies) -> None:
 def claim_table(by_solution: dict[str, Tallies], profile: RequirementProfile) -> pl.DataFrame:
     """One row per solution and requirement, those of the profile that nothing was recorded for included."""
     rows = [
-        _row(solution, requirement, counts.get(requirement.key, Tally()))
+        _requirement_row(solution, requirement, counts.get(requirement.key, Tally()))
         for solution, counts in sorted(by_solution.items())
         for requirement in requirements(profile)
     ]
     return pl.DataFrame(rows, schema=SCHEMA, orient="row")
 
 
-def _row(solution: str, requirement: Requirement, counts: Tally) -> dict[str, Any]:
+def _requirement_row(solution: str, requirement: Requirement, counts: Tally) -> dict[str, Any]:
     """One requirement of one solution, as a row of the result."""
-    shown = requirement.demand.shown(counts)
+    shown = requirement.demand.assess(counts)
     return {
         "solution": solution,
         "requirement": requirement.name,
@@ -153,7 +155,7 @@ def _row(solution: str, requirement: Requirement, counts: Tally) -> dict[str, An
         "hours_known": counts.known_s / S_PER_H,
         "hours_needed": shown.needed,
         "clause": requirement.clause,
-        "reason": NOT_SHOWN[_reason(requirement, counts)] if shown.finding is Compliance.NOT_SHOWN else None,
+        "reason": NOT_SHOWN[_why_not_shown(requirement, counts)] if shown.finding is Compliance.NOT_SHOWN else None,
     }
 
 
@@ -168,7 +170,7 @@ _NEVER = {
 }
 
 
-def _reason(requirement: Requirement, counts: Tally) -> NotShown:
+def _why_not_shown(requirement: Requirement, counts: Tally) -> NotShown:
     """Why a requirement is not shown."""
     if requirement.key in _NEVER:
         return _NEVER[requirement.key]
@@ -183,7 +185,7 @@ def _reason(requirement: Requirement, counts: Tally) -> NotShown:
     return NotShown.PARTLY_SILENT if counts.events == 0 and counts.known_s < counts.held_s else NotShown.TOO_FEW
 
 
-def _notes(
+def _reader_notes(
     runs: pl.DataFrame, outside_h: float, areas: pl.DataFrame | None, ahead_m: float, profile: RequirementProfile
 ) -> list[str]:
     """What the reader must know before the rows."""
@@ -199,14 +201,14 @@ def _notes(
     }
     return [
         *failed_runs(runs),
-        *sentences("claim", {"no_areas": areas is None}),
+        *reservation_sentences("claim", {"no_areas": areas is None}),
         *runs_without_truth(runs, say("claim", "blind")),
         *settings,
-        *sentences("claim", said),
+        *reservation_sentences("claim", said),
     ]
 
 
-def for_reading(claim: Claim) -> pl.DataFrame:
+def rows_for_reading(claim: Claim) -> pl.DataFrame:
     """The rows as they fit a screen: what was found of each requirement, and what it rests on.
 
     Args:

@@ -17,9 +17,9 @@ import polars as pl
 
 from pipeline.results.places import stretches_of, train_path_m
 from pipeline.stages.epochs.clock import Clock
-from pipeline.studies.claim.areas import AreaPlaces, placed
+from pipeline.studies.claim.areas import AreaPlaces, areas_at
 from pipeline.studies.claim.profile import KMH_PER_MPS, Method
-from pipeline.studies.claim.tally import codes, within
+from pipeline.studies.claim.tally import codes, keeps_and_breaks
 from schemas.arrays import NS_PER_S, Bools, Floats, Ints, flags, floats
 from schemas.config import Configuration
 from schemas.enums import Judgement, PassageStatus, VehicleFigures
@@ -27,7 +27,7 @@ from schemas.frozen import frozen
 
 
 @frozen
-class Front:
+class FrontEnd:
     """Of one solution of one run, per epoch; NaN is not known.
 
     `path_m`: estimate of the balise antenna, `front_m`: estimated front end, both path positions. `over_m`: estimate
@@ -54,29 +54,29 @@ class Front:
     where: AreaPlaces
 
     @property
-    def output(self) -> Bools:
-        """The unit says where the train is."""
+    def has_output(self) -> Bools:
+        """Epochs at which the unit says where the train is."""
         return np.isfinite(self.path_m)
 
     @property
-    def without_data_s(self) -> Floats:
+    def gap_after_s(self) -> Floats:
         """How long the log holds nothing after what each epoch holds [s]."""
         steps = np.diff(self.clock.t_ns, append=self.clock.t_ns[-1:]) / NS_PER_S
         return np.where(self.clock.held_s > 0, 0.0, steps)
 
     @property
-    def least_m(self) -> Floats:
+    def least_error_m(self) -> Floats:
         """The smallest size that the error of the estimate may have."""
         return np.maximum(np.maximum(self.low_m, -self.high_m), 0.0)
 
-    def within(self, over_m: Floats | float, under_m: Floats | float) -> Ints:
-        """Whether the estimate is at most so far ahead of the train and so far behind it (`codes`)."""
-        inside, beyond = within(self.low_m, self.high_m, over_m, under_m)
+    def codes_within_m(self, over_m: Floats | float, under_m: Floats | float) -> Ints:
+        """Codes per epoch: is the estimate at most `over_m` ahead of the train and `under_m` behind it?"""
+        inside, beyond = keeps_and_breaks(self.low_m, self.high_m, over_m, under_m)
         asked = np.isfinite(over_m) | np.isfinite(under_m)
         return codes(asked & self.proved & inside, asked & ((self.judged & beyond) | self.wrong_track))
 
 
-def front_of(
+def front_end_of(
     epochs: pl.DataFrame,
     passages: pl.DataFrame,
     run: dict[str, Any],
@@ -84,18 +84,18 @@ def front_of(
     method: Method,
     areas: pl.DataFrame | None = None,
     ahead_m: float = 0.0,
-) -> Front:
+) -> FrontEnd:
     """The front end from the tables of one solution of one run; `ahead_m`: its distance from the balise antenna."""
     path, direction, speed = (floats(epochs, name) for name in ("path_m", "direction", "speed_mps"))
     gnss = flags(epochs, "in_use") & np.isfinite(path)
-    reported = _reported_m(epochs, passages)
+    reported = _reported_position_m(epochs, passages)
     estimate = np.where(gnss, path, reported)
     over, under = (np.where(gnss, floats(epochs, "confidence_m"), floats(epochs, name)) for name in _DOUBTS)
-    late_over, late_under = _latency_s(epochs, run, config)
+    late_over, late_under = _latency_margins_s(epochs, run, config)
     shift = np.where(gnss, 0.0, direction * (estimate - path))
     low = floats(epochs, "error_low_m") + shift
     high = floats(epochs, "error_high_m") + shift
-    right, wrong, elsewhere = _judged(epochs, config.hazards.limits.failure_m)
+    right, wrong, elsewhere = _judged_epochs(epochs, config.hazards.limits.failure_m)
     train_m = np.stack(train_path_m(epochs, stretches_of(epochs)))
     # Without a position nothing was judged: the report is compared with the place of the train itself.
     unpositioned = np.isnan(path) & np.isfinite(train_m).all(axis=0)
@@ -107,7 +107,7 @@ def front_of(
     known = np.isfinite(low) & np.isfinite(high)
     # A train that has not moved yet has no direction of travel: its front end is looked up at the antenna.
     front = estimate + np.nan_to_num(direction) * ahead_m
-    return Front(
+    return FrontEnd(
         clock=Clock.of(epochs, config),
         path_m=estimate,
         front_m=front,
@@ -129,8 +129,8 @@ def front_of(
 _DOUBTS = ("doubt_over_m", "doubt_under_m")
 
 
-def _judged(epochs: pl.DataFrame, limit_m: float) -> tuple[Bools, Bools, Bools]:
-    """Right; wrong; wrong for the track, since the place along it does not make it so."""
+def _judged_epochs(epochs: pl.DataFrame, limit_m: float) -> tuple[Bools, Bools, Bools]:
+    """Epochs judged right; wrong; and wrong for the track, since the place along it does not make them so."""
     judgement = epochs["judgement"].cast(pl.String)
     right, wrong = ((judgement == word).to_numpy() for word in (Judgement.RIGHT.value, Judgement.WRONG.value))
     with np.errstate(invalid="ignore"):
@@ -138,7 +138,7 @@ def _judged(epochs: pl.DataFrame, limit_m: float) -> tuple[Bools, Bools, Bools]:
     return right, wrong, wrong & ~along
 
 
-def _latency_s(epochs: pl.DataFrame, run: dict[str, Any], config: Configuration) -> tuple[Floats, Floats]:
+def _latency_margins_s(epochs: pl.DataFrame, run: dict[str, Any], config: Configuration) -> tuple[Floats, Floats]:
     """How much latency widens the interval behind and ahead of the estimate [s]; what is unknown widens nothing.
 
     A learned latency is not taken out of positions (DOMAIN 5.1), so the train may be ahead by it.
@@ -149,7 +149,7 @@ def _latency_s(epochs: pl.DataFrame, run: dict[str, Any], config: Configuration)
     return np.maximum(spread - late, 0.0), np.maximum(spread + late, 0.0)
 
 
-def _reported_m(epochs: pl.DataFrame, passages: pl.DataFrame) -> Floats:
+def _reported_position_m(epochs: pl.DataFrame, passages: pl.DataFrame) -> Floats:
     """Path position by the last relevant balise and the odometer's distance since then."""
     accepted = passages.filter(pl.col("status").cast(pl.String) == PassageStatus.ACCEPTED.value).drop_nulls("path_m")
     odometer = floats(epochs, "odometer_m")
@@ -174,7 +174,7 @@ def _areas_at(front_m: Floats, epochs: pl.DataFrame, areas: pl.DataFrame | None,
     fronts = pl.DataFrame({"path_m": front_m}, schema={"path_m": pl.Float64}).fill_nan(None).with_row_index("row")
     near = fronts.drop_nulls().sort("path_m").join_asof(known, on="path_m", strategy="nearest", tolerance=reach_m)
     places = fronts.select("row").join(near, on="row", how="left", maintain_order="left")
-    return placed(areas, places["netelement_id"], places["measure_m"])
+    return areas_at(areas, places["netelement_id"], places["measure_m"])
 
 
 @frozen
@@ -191,21 +191,21 @@ class SpeedErrors:
     low_kmh: Floats
     high_kmh: Floats
 
-    def within(self, over_kmh: Floats | float, under_kmh: Floats | float) -> Ints:
-        """Whether the estimate is at most so much above the train's speed and so much below it (`codes`)."""
-        return codes(*within(self.low_kmh, self.high_kmh, over_kmh, under_kmh))
+    def codes_within_kmh(self, over_kmh: Floats | float, under_kmh: Floats | float) -> Ints:
+        """Codes per window: is the estimate at most so much above the train's speed and below it?"""
+        return codes(*keeps_and_breaks(self.low_kmh, self.high_kmh, over_kmh, under_kmh))
 
 
-def speed_errors(front: Front, window_s: float) -> SpeedErrors:
+def speed_errors(front: FrontEnd, window_s: float) -> SpeedErrors:
     """One window after the other; none over a gap, a reversal, or epochs without a speed."""
     clock = front.clock
-    pairs = _windows(front, round(window_s * NS_PER_S))
+    pairs = _speed_windows(front, round(window_s * NS_PER_S))
     first, last = np.array(pairs, dtype=np.int64).reshape(-1, 2).T
     length_s = (clock.t_ns[last] - clock.t_ns[first]) / NS_PER_S
     steps_m = 0.5 * (front.speed_mps[1:] + front.speed_mps[:-1]) * clock.held_s[:-1]
     until_m = np.concatenate(([0.0], np.cumsum(np.nan_to_num(steps_m))))
     estimated_m = front.direction[first] * (until_m[last] - until_m[first])
-    least_m, most_m = _driven_m(front, first, last)
+    least_m, most_m = _driven_interval_m(front, first, last)
     # The more the train drove, the lower the estimate lies relative to it.
     low_kmh = (estimated_m - most_m) / length_s * KMH_PER_MPS
     high_kmh = (estimated_m - least_m) / length_s * KMH_PER_MPS
@@ -213,17 +213,17 @@ def speed_errors(front: Front, window_s: float) -> SpeedErrors:
     return SpeedErrors(clock.t_ns[last], length_s, fastest * KMH_PER_MPS, low_kmh, high_kmh)
 
 
-def _driven_m(front: Front, first: Ints, last: Ints) -> tuple[Floats, Floats]:
+def _driven_interval_m(front: FrontEnd, first: Ints, last: Ints) -> tuple[Floats, Floats]:
     """Least and largest distance of the train over windows by the evidence [m]; NaN unless it calls both ends right."""
-    begin_m = _train_m(front, first)
-    end_m = _train_m(front, last)
+    begin_m = _train_interval_m(front, first)
+    end_m = _train_interval_m(front, last)
     # The estimate is a mean over the time before each epoch: how late that is while the speed changes is not known.
     late_m = front.speed_late_s * np.abs(front.speed_mps[last] - front.speed_mps[first])
     late_m = np.where(front.proved[first] & front.proved[last], late_m, np.nan)
     return end_m[0] - begin_m[1] - late_m, end_m[1] - begin_m[0] + late_m
 
 
-def _train_m(front: Front, rows: Ints) -> Floats:
+def _train_interval_m(front: FrontEnd, rows: Ints) -> Floats:
     """Least and largest place of the train in its direction of travel [m]; at joints the estimate less its error."""
     sense = front.direction[rows]
     evidence = np.sort(front.direction[rows] * front.train_m[:, rows], axis=0)
@@ -231,7 +231,7 @@ def _train_m(front: Front, rows: Ints) -> Floats:
     return np.where(np.isfinite(evidence).all(axis=0), evidence, by_error)
 
 
-def _windows(front: Front, window_ns: int) -> list[tuple[int, int]]:
+def _speed_windows(front: FrontEnd, window_ns: int) -> list[tuple[int, int]]:
     """First and last epoch of each window, over which the speed and one direction of travel are known."""
     held = front.clock.held_s
     t_ns = front.clock.t_ns

@@ -65,7 +65,7 @@ class AfterBalise(Settings):
     clause: str
 
     def limit_m(self, speed_mps: Floats) -> Floats:
-        """[m] at a speed [m/s]; NaN above `to_kmh`, where nothing is demanded."""
+        """The limit [m] at a speed [m/s]; NaN above `to_kmh`, where nothing is demanded."""
         kmh = np.abs(speed_mps) * KMH_PER_MPS
         limit = np.where(kmh < self.below_kmh, self.fixed_m, self.offset_m + self.per_mps_s * np.abs(speed_mps))
         return np.where(kmh <= self.to_kmh, limit, np.nan)
@@ -81,13 +81,15 @@ class SafeSpeed(Settings):
     clause: str
 
     def limit_kmh(self, speed_kmh: Floats) -> Floats:
-        """[km/h] at a speed [km/h]; NaN above `at_kmh`, where nothing is demanded."""
+        """The limit [km/h] at a speed [km/h]; NaN above `at_kmh`, where nothing is demanded."""
         speed = np.abs(speed_kmh)
         limit = np.interp(speed, [self.below_kmh, self.at_kmh], [self.low_kmh, self.high_kmh])
         return np.where(speed <= self.at_kmh, limit, np.nan)
 
 
 class EstimatedSpeed(Settings):
+    """Accuracy of the estimated speed."""
+
     fixed_kmh: Positive
     to_kmh: Positive
     above_share: Positive
@@ -95,12 +97,14 @@ class EstimatedSpeed(Settings):
     clause: str
 
     def limit_kmh(self, speed_kmh: Floats) -> Floats:
-        """[km/h] at a speed [km/h]."""
+        """The limit [km/h] at a speed [km/h]."""
         speed = np.abs(speed_kmh)
         return np.where(speed <= self.to_kmh, self.fixed_kmh, self.above_share * speed)
 
 
 class Start(Settings):
+    """Times from start of mission to the first output."""
+
     last_position_s: Positive
     cold_movement_s: Positive
     nothing_s: Positive
@@ -108,11 +112,15 @@ class Start(Settings):
 
 
 class ColdMovement(Settings):
+    """Movement while switched off."""
+
     detected_h: Positive
     clause: str
 
 
 class Availability(Settings):
+    """Share of time with an output, and how long it may be missing."""
+
     share: Probability
     outside_s: Positive
     within_s: Positive
@@ -120,11 +128,15 @@ class Availability(Settings):
 
 
 class DistanceLimits(Settings):
+    """Distances that have to be covered without physical balises."""
+
     without_balise_m: Positive
     clause: str
 
 
 class FailureRate(Settings):
+    """A rate of failures per hour."""
+
     aim_per_h: Positive
     bound_per_h: Positive
     clause: str

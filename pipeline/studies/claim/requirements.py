@@ -11,7 +11,7 @@ import numpy as np
 import polars as pl
 
 from pipeline.studies.claim.areas import AREA_TYPES, NO_AREA
-from pipeline.studies.claim.front import Front, SpeedErrors, speed_errors
+from pipeline.studies.claim.front import FrontEnd, SpeedErrors, speed_errors
 from pipeline.studies.claim.profile import KMH_PER_MPS, AreaLimits, RequirementProfile
 from pipeline.studies.claim.tally import (
     ALWAYS,
@@ -36,15 +36,15 @@ class ClaimJourney:
     """One solution of one run: its front end, and the tables that the requirements ask for besides."""
 
     name: str
-    front: Front
+    front: FrontEnd
     epochs: pl.DataFrame
     passages: pl.DataFrame
     profile: RequirementProfile
 
-    def tally(self, code: Ints, where: Bools, size: Floats | None = None) -> Tally:
+    def tally_epochs(self, code: Ints, where: Bools, size: Floats | None = None) -> Tally:
         """Tally of the epochs `where` a requirement applies, and of the gaps of the log that begin or end there."""
         clock = self.front.clock
-        without_data_s = self.front.without_data_s
+        without_data_s = self.front.gap_after_s
         rows = np.flatnonzero(where | ((without_data_s > 0) & np.append(where[1:], False)))
         here = where[rows]
         held = np.where(here, clock.held_s[rows], 0.0)
@@ -54,9 +54,9 @@ class ClaimJourney:
             self.name, clock.t_ns[rows], held, codes, self.profile.method.event_gap_s, sizes, without_data_s[rows]
         )
 
-    def inside(self, kind: AreaType) -> Bools:
+    def inside_area(self, kind: AreaType) -> Bools:
         """Epochs with an estimated front end in areas of this type."""
-        inside: Bools = self.front.output & (self.front.where.area == AREA_TYPES.index(kind))
+        inside: Bools = self.front.has_output & (self.front.where.area == AREA_TYPES.index(kind))
         return inside
 
     @cached_property
@@ -69,7 +69,7 @@ class ClaimJourney:
         return limits
 
     @cached_property
-    def beyond(self) -> dict[str, tuple[Ints, Floats]]:
+    def beyond_limits(self) -> dict[str, tuple[Ints, Floats]]:
         """The intervals claimed, and the errors known, against MAPO and MAPU: codes and sizes."""
         front = self.front
         limit_m = self.limit_m
@@ -79,8 +79,8 @@ class ClaimJourney:
         return {
             "mapo_claimed": (claimed[0], front.over_m),
             "mapu_claimed": (claimed[1], front.under_m),
-            "mapo": (_asked(front.within(limit_m, none), limit_m), front.low_m),
-            "mapu": (_asked(front.within(none, limit_m), limit_m), -front.high_m),
+            "mapo": (_codes_where_demanded(front.codes_within_m(limit_m, none), limit_m), front.low_m),
+            "mapu": (_codes_where_demanded(front.codes_within_m(none, limit_m), limit_m), -front.high_m),
         }
 
     @cached_property
@@ -89,14 +89,14 @@ class ClaimJourney:
         return speed_errors(self.front, self.profile.method.speed_window_s)
 
     @cached_property
-    def safe(self) -> Ints:
-        """The train between min and max safe front end."""
-        return self.front.within(self.front.over_m, self.front.under_m)
+    def safe_codes(self) -> Ints:
+        """Codes per epoch: is the train between min and max safe front end?"""
+        return self.front.codes_within_m(self.front.over_m, self.front.under_m)
 
-    def outside(self) -> Tally:
+    def tally_outside(self) -> Tally:
         """Time with an estimated front end outside all areas."""
-        nowhere = self.front.output & (self.front.where.area == NO_AREA)
-        return self.tally(np.full(nowhere.size, NOT_KNOWN), nowhere)
+        nowhere = self.front.has_output & (self.front.where.area == NO_AREA)
+        return self.tally_epochs(np.full(nowhere.size, NOT_KNOWN), nowhere)
 
 
 Key = tuple[str, str]
@@ -129,38 +129,46 @@ def requirements(profile: RequirementProfile) -> list[Requirement]:
     """The requirements of a profile in their order."""
     rate = profile.failure_rate
     return [
-        *(requirement for kind, area in profile.areas.items() for requirement in _of_area(kind, area, profile)),
-        Requirement("safe_front_end", ALL, "own CI", Demand(Kind.RATE, rate.aim_per_h), rate.clause, _safe),
-        Requirement("safe_front_end_bound", ALL, "own CI", Demand(Kind.RATE, rate.bound_per_h), rate.clause, _safe),
-        *(requirement for kind in profile.slow.area_types for requirement in _slow(kind, profile)),
-        *_after_balise(profile),
-        *_speed(profile),
-        *_start(profile),
-        *_operation(profile),
+        *(
+            requirement
+            for kind, area in profile.areas.items()
+            for requirement in _area_requirements(kind, area, profile)
+        ),
+        Requirement("safe_front_end", ALL, "own CI", Demand(Kind.RATE, rate.aim_per_h), rate.clause, _tally_safe),
+        Requirement(
+            "safe_front_end_bound", ALL, "own CI", Demand(Kind.RATE, rate.bound_per_h), rate.clause, _tally_safe
+        ),
+        *(requirement for kind in profile.slow.area_types for requirement in _slow_requirements(kind, profile)),
+        *_balise_requirements(profile),
+        *_speed_requirements(profile),
+        *_start_requirements(profile),
+        *_operation_requirements(profile),
     ]
 
 
-def _safe(journey: ClaimJourney, kind: AreaType | None = None) -> Tally:
-    """The train between min and max safe front end, in areas of one type or wherever it is."""
-    where = journey.front.output if kind is None else journey.inside(kind)
-    return journey.tally(journey.safe, where, journey.front.least_m)
+def _tally_safe(journey: ClaimJourney, kind: AreaType | None = None) -> Tally:
+    """Tally of the train between min and max safe front end, in areas of one type or wherever it is."""
+    where = journey.front.has_output if kind is None else journey.inside_area(kind)
+    return journey.tally_epochs(journey.safe_codes, where, journey.front.least_error_m)
 
 
-def _asked(code: Ints, limit: Floats) -> Ints:
+def _codes_where_demanded(code: Ints, limit: Floats) -> Ints:
     """The codes, not known where nothing is demanded (NaN)."""
     return np.where(np.isfinite(limit), code, NOT_KNOWN)
 
 
-def _of_area(kind: AreaType, area: AreaLimits, profile: RequirementProfile) -> list[Requirement]:
+def _area_requirements(kind: AreaType, area: AreaLimits, profile: RequirementProfile) -> list[Requirement]:
     """What is demanded in areas of one type: MAPO and MAPU, safe front end, accuracy."""
 
-    def exceeded(journey: ClaimJourney, name: str) -> Tally:
-        code, size = journey.beyond[name]
-        return journey.tally(code, journey.inside(kind), size)
+    def tally_exceeded(journey: ClaimJourney, name: str) -> Tally:
+        """Tally of the limit of one name, claimed or known."""
+        code, size = journey.beyond_limits[name]
+        return journey.tally_epochs(code, journey.inside_area(kind), size)
 
-    def close(journey: ClaimJourney) -> Tally:
-        code = journey.front.within(area.accuracy_m, area.accuracy_m)
-        return journey.tally(code, journey.inside(kind), journey.front.least_m)
+    def tally_accuracy(journey: ClaimJourney) -> Tally:
+        """Tally of the accuracy of the estimated front end."""
+        code = journey.front.codes_within_m(area.accuracy_m, area.accuracy_m)
+        return journey.tally_epochs(code, journey.inside_area(kind), journey.front.least_error_m)
 
     of = kind.value
     rate = profile.failure_rate
@@ -170,55 +178,58 @@ def _of_area(kind: AreaType, area: AreaLimits, profile: RequirementProfile) -> l
     often = Demand(Kind.SHARE, area.accuracy_share)
     return [
         *(
-            Requirement(name, of, limit, ALWAYS, area.limit_clause, partial(exceeded, name=name))
+            Requirement(name, of, limit, ALWAYS, area.limit_clause, partial(tally_exceeded, name=name))
             for name in ("mapo_claimed", "mapu_claimed", "mapo", "mapu")
         ),
-        Requirement("safe_front_end", of, "own CI", aim, rate.clause, partial(_safe, kind=kind)),
-        Requirement("front_accuracy", of, near, often, area.accuracy_clause, close),
+        Requirement("safe_front_end", of, "own CI", aim, rate.clause, partial(_tally_safe, kind=kind)),
+        Requirement("front_accuracy", of, near, often, area.accuracy_clause, tally_accuracy),
     ]
 
 
-def _slow(kind: AreaType, profile: RequirementProfile) -> list[Requirement]:
-    """Safe and precise operation at low speed: claimed and known."""
+def _slow_requirements(kind: AreaType, profile: RequirementProfile) -> list[Requirement]:
+    """Safe and precise operation at low speed: tally_claimed and tally_known."""
     slow = profile.slow
     of = kind.value
 
-    def here(journey: ClaimJourney) -> Bools:
-        return journey.inside(kind) & (np.abs(journey.front.speed_mps) * KMH_PER_MPS < slow.below_kmh)
+    def are_slow_inside(journey: ClaimJourney) -> Bools:
+        """Epochs in such an area, below the speed."""
+        return journey.inside_area(kind) & (np.abs(journey.front.speed_mps) * KMH_PER_MPS < slow.below_kmh)
 
-    def claimed(journey: ClaimJourney) -> Tally:
+    def tally_claimed(journey: ClaimJourney) -> Tally:
+        """Tally of the interval that is tally_claimed."""
         width = np.maximum(journey.front.over_m, journey.front.under_m)
-        return journey.tally(codes(width <= slow.limit_m, width > slow.limit_m), here(journey), width)
+        return journey.tally_epochs(codes(width <= slow.limit_m, width > slow.limit_m), are_slow_inside(journey), width)
 
-    def known(journey: ClaimJourney, limit_m: float) -> Tally:
-        return journey.tally(journey.front.within(limit_m, limit_m), here(journey))
+    def tally_known(journey: ClaimJourney, limit_m: float) -> Tally:
+        """Tally of the error that is tally_known."""
+        return journey.tally_epochs(journey.front.codes_within_m(limit_m, limit_m), are_slow_inside(journey))
 
     limit = f"{slow.limit_m:g} m"
     close = f"{slow.accuracy_m:g} m"
-    safe, accurate = (partial(known, limit_m=limit_m) for limit_m in (slow.limit_m, slow.accuracy_m))
+    safe, accurate = (partial(tally_known, limit_m=limit_m) for limit_m in (slow.limit_m, slow.accuracy_m))
     return [
-        Requirement("slow_claimed", of, limit, ALWAYS, slow.clause, claimed),
+        Requirement("slow_claimed", of, limit, ALWAYS, slow.clause, tally_claimed),
         Requirement("slow_front_end", of, limit, ALWAYS, slow.clause, safe),
         Requirement("slow_accuracy", of, close, Demand(Kind.SHARE, slow.accuracy_share), slow.clause, accurate),
     ]
 
 
-def _after_balise(profile: RequirementProfile) -> list[Requirement]:
+def _balise_requirements(profile: RequirementProfile) -> list[Requirement]:
     """The first estimate after each balise accepted; physical ones, and virtual ones as if they were.
 
     Where it comes late or not at all nobody knows what it would have been.
     """
     after = profile.after_balise
 
-    def count(journey: ClaimJourney, kind: BaliseKind) -> Tally:
+    def tally_balises(journey: ClaimJourney, kind: BaliseKind) -> Tally:
         """The balises of one kind on one journey, those passed faster than the requirement reaches left out."""
         front = journey.front
         limit = after.limit_m(journey.front.speed_mps)
         # One more row: no epoch after the balise.
-        code = np.append(_asked(front.within(limit, limit), limit), NOT_KNOWN)
+        code = np.append(_codes_where_demanded(front.codes_within_m(limit, limit), limit), NOT_KNOWN)
         faster = np.append(np.abs(front.speed_mps) * KMH_PER_MPS > after.to_kmh, False)
-        at_ns = _passed(journey.passages, kind)
-        rows = _first_after(front, at_ns)
+        at_ns = _passings_ns(journey.passages, kind)
+        rows = _first_epochs_after(front, at_ns)
         at_ns = at_ns[~faster[rows]]
         rows = rows[~faster[rows]]
         # Each balise weighs the same, whatever time its epoch holds.
@@ -231,11 +242,12 @@ def _after_balise(profile: RequirementProfile) -> list[Requirement]:
     often = Demand(Kind.SHARE, after.share)
     kinds = (BaliseKind.PHYSICAL, BaliseKind.VIRTUAL)
     return [
-        Requirement("after_balise", kind.value, near, often, after.clause, partial(count, kind=kind)) for kind in kinds
+        Requirement("after_balise", kind.value, near, often, after.clause, partial(tally_balises, kind=kind))
+        for kind in kinds
     ]
 
 
-def _passed(passages: pl.DataFrame, kind: BaliseKind) -> Ints:
+def _passings_ns(passages: pl.DataFrame, kind: BaliseKind) -> Ints:
     """When each accepted balise of a kind was passed as far as known [ns], in order."""
     status, kinds = (pl.col(name).cast(pl.String) for name in ("status", "kind"))
     accepted = passages.filter((status == PassageStatus.ACCEPTED.value) & (kinds == kind.value))
@@ -243,7 +255,7 @@ def _passed(passages: pl.DataFrame, kind: BaliseKind) -> Ints:
     return np.sort(at["t"].dt.timestamp("ns").to_numpy())
 
 
-def _first_after(front: Front, at_ns: Ints) -> Ints:
+def _first_epochs_after(front: FrontEnd, at_ns: Ints) -> Ints:
     """The epoch at or right after each instant; one beyond the last where there is none, or a gap lies between."""
     t_ns = front.clock.t_ns
     row = np.searchsorted(t_ns, at_ns)
@@ -251,23 +263,24 @@ def _first_after(front: Front, at_ns: Ints) -> Ints:
     return np.where(late, t_ns.size, row)
 
 
-def _speed(profile: RequirementProfile) -> list[Requirement]:
+def _speed_requirements(profile: RequirementProfile) -> list[Requirement]:
     """What is demanded of the speed: MASO and MASU, accuracy."""
     safe = profile.safe_speed
     speed = profile.speed
 
-    def count(
+    def tally_speed(
         journey: ClaimJourney, limit_kmh: Callable[[Floats], Floats], over: bool = True, under: bool = True
     ) -> Tally:
+        """Tally of the speed against a limit, over or under it or both."""
         limit = limit_kmh(journey.speeds.fastest_kmh)
-        code = journey.speeds.within(limit if over else np.inf, limit if under else np.inf)
-        return _of_windows(journey, code, np.isfinite(limit))
+        code = journey.speeds.codes_within_kmh(limit if over else np.inf, limit if under else np.inf)
+        return _tally_windows(journey, code, np.isfinite(limit))
 
     margin = f"{safe.low_kmh:g} km/h to {safe.below_kmh:g}, {safe.high_kmh:g} at {safe.at_kmh:g} km/h"
     near = f"{speed.fixed_kmh:g} km/h to {speed.to_kmh:g} km/h, {speed.above_share:.0%} above"
-    ahead = partial(count, limit_kmh=safe.limit_kmh, under=False)
-    behind = partial(count, limit_kmh=safe.limit_kmh, over=False)
-    close = partial(count, limit_kmh=speed.limit_kmh)
+    ahead = partial(tally_speed, limit_kmh=safe.limit_kmh, under=False)
+    behind = partial(tally_speed, limit_kmh=safe.limit_kmh, over=False)
+    close = partial(tally_speed, limit_kmh=speed.limit_kmh)
     return [
         Requirement("maso", ALL, margin, ALWAYS, safe.clause, ahead),
         Requirement("masu", ALL, margin, ALWAYS, safe.clause, behind),
@@ -275,11 +288,11 @@ def _speed(profile: RequirementProfile) -> list[Requirement]:
     ]
 
 
-def _of_windows(journey: ClaimJourney, code: Ints, where: Bools) -> Tally:
+def _tally_windows(journey: ClaimJourney, code: Ints, where: Bools) -> Tally:
     """Tally of windows of speed, and of the gaps of the log between them, in order of time."""
     speeds = journey.speeds
-    gaps = np.flatnonzero(journey.front.without_data_s > 0)
-    gap_s = journey.front.without_data_s[gaps]
+    gaps = np.flatnonzero(journey.front.gap_after_s > 0)
+    gap_s = journey.front.gap_after_s[gaps]
     nothing = np.zeros(gaps.size)
     t_ns = np.concatenate((speeds.t_ns, journey.front.clock.t_ns[gaps]))
     held_s = np.concatenate((speeds.length_s, nothing))
@@ -291,23 +304,25 @@ def _of_windows(journey: ClaimJourney, code: Ints, where: Bools) -> Tally:
     return count_claims(journey.name, t_ns[rows], held_s[rows], codes[rows], gap, without_data_s=without_data_s[rows])
 
 
-def _start(profile: RequirementProfile) -> list[Requirement]:
+def _start_requirements(profile: RequirementProfile) -> list[Requirement]:
     """Start of mission: times from the log's begin, which is no switch-on."""
     start = profile.start
 
-    def first(journey: ClaimJourney) -> Tally:
+    def tally_first_use(journey: ClaimJourney) -> Tally:
+        """Tally of the time to the tally_first_use position in use."""
         return Tally(trials=1, worst=_first_s(journey, flags(journey.epochs, "in_use")))
 
-    def nothing(journey: ClaimJourney) -> Tally:
+    def tally_no_output(journey: ClaimJourney) -> Tally:
+        """Tally of the time to the tally_first_use output."""
         worst = _first_s(journey, flags(journey.epochs, "tvb") | journey.epochs["lrvb_id"].is_not_null().to_numpy())
         waited = (journey.front.clock.duration_s or 0.0) if worst is None else worst
-        return replace(_one(broken=waited > start.nothing_s), worst=worst)
+        return replace(_tally_run(broken=waited > start.nothing_s), worst=worst)
 
     moved = profile.cold_movement
     return [
-        Requirement("start", "last position", f"{start.last_position_s:g} s", ALWAYS, start.clause, first),
+        Requirement("start", "last position", f"{start.last_position_s:g} s", ALWAYS, start.clause, tally_first_use),
         Requirement("start", "cold movement", f"{start.cold_movement_s:g} s", ALWAYS, start.clause),
-        Requirement("start", "nothing known", f"{start.nothing_s:g} s", ALWAYS, start.clause, nothing),
+        Requirement("start", "nothing known", f"{start.nothing_s:g} s", ALWAYS, start.clause, tally_no_output),
         Requirement("cold_movement", ALL, f"{moved.detected_h:g} h", ALWAYS, moved.clause),
     ]
 
@@ -318,26 +333,26 @@ def _first_s(journey: ClaimJourney, there: Bools) -> float | None:
     return float((t_ns[there][0] - t_ns[0]) / NS_PER_S) if there.any() else None
 
 
-def _one(broken: bool) -> Tally:
+def _tally_run(broken: bool) -> Tally:
     """A run that broke a demand, or of which nobody can say that it kept it."""
     return Tally(trials=1, broken=int(broken), events=int(broken), possible=1)
 
 
-def _operation(profile: RequirementProfile) -> list[Requirement]:
+def _operation_requirements(profile: RequirementProfile) -> list[Requirement]:
     """Availability, and stretches without physical balises: none is ever proved."""
     asked = profile.availability
     length_m = profile.way.without_balise_m
     outside = f"{asked.outside_s:g} s in {asked.within_s / S_PER_H:g} h"
     demand = Demand(Kind.AVAILABILITY, asked.share, outside_s=asked.outside_s)
     return [
-        Requirement("availability", ALL, outside, demand, asked.clause, _availability),
+        Requirement("availability", ALL, outside, demand, asked.clause, _tally_availability),
         Requirement(
-            "way_without_balise", ALL, f"{length_m / 1000:g} km", ALWAYS, profile.way.clause, _without_physical_balises
+            "way_without_balise", ALL, f"{length_m / 1000:g} km", ALWAYS, profile.way.clause, _tally_without_balises
         ),
     ]
 
 
-def _availability(journey: ClaimJourney) -> Tally:
+def _tally_availability(journey: ClaimJourney) -> Tally:
     """Time lost once there was an output; broken where so much of it lies within so long.
 
     Lost is no output, or an interval wider than MAPCI; gaps of the log, where nobody knows, are left out.
@@ -345,15 +360,15 @@ def _availability(journey: ClaimJourney) -> Tally:
     front = journey.front
     asked = journey.profile.availability
     with np.errstate(invalid="ignore"):
-        lost: Bools = ~front.output | (front.over_m + front.under_m > 2.0 * journey.limit_m)
-    held = front.clock.held_s * (np.cumsum(front.output) > 0)
+        lost: Bools = ~front.has_output | (front.over_m + front.under_m > 2.0 * journey.limit_m)
+    held = front.clock.held_s * (np.cumsum(front.has_output) > 0)
     t_s = (front.clock.t_ns - front.clock.t_ns[:1]) / NS_PER_S
     until = np.cumsum(np.where(lost, held, 0.0))
     # Time lost up to the begin of the window that ends at each epoch.
     before = np.concatenate(([0.0], until))[np.searchsorted(t_s, t_s - asked.within_s)]
     worst_s = float((until - before).max(initial=0.0))
     return replace(
-        _one(broken=worst_s >= asked.outside_s),
+        _tally_run(broken=worst_s >= asked.outside_s),
         held_s=float(held.sum()),
         known_s=float(held[~lost].sum()),
         worst=worst_s,
@@ -361,15 +376,15 @@ def _availability(journey: ClaimJourney) -> Tally:
     )
 
 
-def _without_physical_balises(journey: ClaimJourney) -> Tally:
+def _tally_without_balises(journey: ClaimJourney) -> Tally:
     """Stretches of at least the demanded length between physical balises; broken where MAPO or MAPU was exceeded on
     one.
     """
     odometer = journey.epochs["odometer_m"].cast(pl.Float64).to_numpy()
     driven_m = np.cumsum(np.abs(np.nan_to_num(np.diff(odometer, prepend=odometer[:1]))))
-    cuts = np.searchsorted(journey.front.clock.t_ns, _passed(journey.passages, BaliseKind.PHYSICAL))
+    cuts = np.searchsorted(journey.front.clock.t_ns, _passings_ns(journey.passages, BaliseKind.PHYSICAL))
     bounds = np.unique(np.concatenate(([0], cuts, [driven_m.size])))
-    broken = np.logical_or.reduce([code == BROKEN for code, _ in journey.beyond.values()])
+    broken = np.logical_or.reduce([code == BROKEN for code, _ in journey.beyond_limits.values()])
     lengths = [float(driven_m[min(last, driven_m.size - 1)] - driven_m[first]) for first, last in pairwise(bounds)]
     long = [number for number, length in enumerate(lengths) if length >= journey.profile.way.without_balise_m]
     bad = sum(bool(broken[bounds[number] : bounds[number + 1]].any()) for number in long)

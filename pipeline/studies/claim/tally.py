@@ -48,7 +48,7 @@ class Tally:
         return Tally(**counts, worst=max(sizes, default=None), longest_s=max(self.longest_s, other.longest_s))
 
 
-def within(low: Floats, high: Floats, over: Floats | float, under: Floats | float) -> tuple[Bools, Bools]:
+def keeps_and_breaks(low: Floats, high: Floats, over: Floats | float, under: Floats | float) -> tuple[Bools, Bools]:
     """Whether an error between `low` and `high` is at most `over` and not below `-under`; whether it is beyond."""
     with np.errstate(invalid="ignore"):
         return (high <= over) & (low >= -np.asarray(under)), (low > over) | (high < -np.asarray(under))
@@ -75,7 +75,7 @@ def count_claims(
     if code.size == 0:
         return Tally()
     without_data = np.broadcast_to(without_data_s, code.shape)
-    trial = _trial(run, held_s, without_data, code)
+    trial = _drawn_code(run, held_s, without_data, code)
     known = code != NOT_KNOWN
     sizes = size[known & np.isfinite(size)] if size is not None else np.empty(0)
     doubtful = (code != KEPT) | (without_data > 0)
@@ -84,15 +84,15 @@ def count_claims(
         trials=1,
         kept=int(trial == KEPT),
         broken=int(trial == BROKEN),
-        events=len(clusters_s(t_ns[code == BROKEN], t_ns[code == BROKEN], gap_s)),
-        possible=sum(int(span_s // gap_s) + 1 for span_s in clusters_s(t_ns[doubtful], until_ns[doubtful], gap_s)),
+        events=len(group_lengths_s(t_ns[code == BROKEN], t_ns[code == BROKEN], gap_s)),
+        possible=sum(int(span_s // gap_s) + 1 for span_s in group_lengths_s(t_ns[doubtful], until_ns[doubtful], gap_s)),
         held_s=float(held_s.sum()),
         known_s=float(held_s[known].sum()),
         worst=float(sizes.max()) if sizes.size else None,
     )
 
 
-def clusters_s(from_ns: Ints, to_ns: Ints, gap_s: float) -> list[float]:
+def group_lengths_s(from_ns: Ints, to_ns: Ints, gap_s: float) -> list[float]:
     """Lengths [s] of the groups of stretches that lie no more than `gap_s` apart; in order of time."""
     if from_ns.size == 0:
         return []
@@ -103,7 +103,7 @@ def clusters_s(from_ns: Ints, to_ns: Ints, gap_s: float) -> list[float]:
     return lengths
 
 
-def _trial(run: str, held_s: Floats, without_data_s: Floats, code: Ints) -> int:
+def _drawn_code(run: str, held_s: Floats, without_data_s: Floats, code: Ints) -> int:
     """The code of one instant by chance; of one epoch where none of them holds for any time."""
     # What an epoch holds, then what has no data after it, one after the other.
     lengths = np.column_stack([held_s, without_data_s]).ravel()
@@ -112,10 +112,10 @@ def _trial(run: str, held_s: Floats, without_data_s: Floats, code: Ints) -> int:
         lengths = np.ones(code.size)
         codes_of = code
     until = np.cumsum(lengths)
-    return int(codes_of[np.searchsorted(until, drawn(run) * until[-1], side="right")])
+    return int(codes_of[np.searchsorted(until, random_share(run) * until[-1], side="right")])
 
 
-def drawn(run: str) -> float:
+def random_share(run: str) -> float:
     """A number from 0 to below 1 by chance, always the same for the same run."""
     return int.from_bytes(hashlib.sha256(run.encode()).digest()[:6], "big") / (1 << 48)
 
@@ -149,20 +149,20 @@ class Demand:
             return "always"
         return f"< {self.limit:g} /h" if self.kind is Kind.RATE else f"p >= {self.limit:g}"
 
-    def shown(self, tally: Tally) -> Shown:
-        """`needed` in hours."""
+    def assess(self, tally: Tally) -> Shown:
+        """What counts show of the demand; `needed` in hours."""
         hours_known = tally.known_s / S_PER_H
         if self.kind is Kind.RATE:
             return rate_shown(tally.events, tally.possible, tally.held_s / S_PER_H, hours_known, self.limit)
         if self.kind is Kind.AVAILABILITY:
-            return self._available(tally)
+            return self._assess_availability(tally)
         if self.kind is Kind.SHARE:
-            return self._often(tally)
+            return self._assess_share(tally)
         # One event breaks a maximum that is demanded without a probability, and no number of hours shows it.
         finding = Compliance.NOT_MET if tally.events else Compliance.NOT_SHOWN
         return Shown(finding, poisson_rate(tally.events, hours_known))
 
-    def _often(self, tally: Tally) -> Shown:
+    def _assess_share(self, tally: Tally) -> Shown:
         """A share of runs; the figure with its bounds is of the runs judged."""
         if tally.trials == 0:
             return Shown(Compliance.NOT_SHOWN)
@@ -175,7 +175,7 @@ class Demand:
         unknown = self.by_means or broken.needed is None or hours <= 0.0
         return Shown(broken.finding, kept, None if unknown else hours * (broken.needed or 0))
 
-    def _available(self, tally: Tally) -> Shown:
+    def _assess_availability(self, tally: Tally) -> Shown:
         """Broken runs were unavailable for `outside_s` at least, so for that part of the longest run at least.
 
         Never `met`: the result does not hold the confidence of speed, nor what stood in gaps of the log.

@@ -29,7 +29,7 @@ def piece_classes(
     places = pl.DataFrame(
         {
             "piece": np.arange(len(pieces.element)),
-            "netelement_id": pieces.names,
+            "netelement_id": pieces.element_names,
             "from_m": pieces.from_m,
             "to_m": pieces.to_m,
         }
@@ -46,10 +46,10 @@ def piece_classes(
         .with_columns(bad=pl.col("lost") + pl.col("wrong_in_use"))
         .with_columns(passes=pl.col("right") + pl.col("bad"))
     )
-    return conform(_judged(counted, criteria), LinePieces)
+    return conform(_classify(counted, criteria), LinePieces)
 
 
-def trials(passes: pl.DataFrame, criteria: LineCriteria) -> pl.DataFrame:
+def independent_passes(passes: pl.DataFrame, criteria: LineCriteria) -> pl.DataFrame:
     """Independent passes: each run, or the worst of a day."""
     if criteria.independent == "pass":
         return passes
@@ -78,7 +78,7 @@ def _count_per_piece(passes: pl.DataFrame, criteria: LineCriteria) -> pl.DataFra
     hour = pl.col("t").dt.strftime("%H").unique()
     hours = passes.filter(right).group_by(KEYS).agg(hours=hour.len(), hours_of_day=hour.sort().str.join(" "))
     return (
-        trials(passes, criteria)
+        independent_passes(passes, criteria)
         .group_by(KEYS)
         .agg(
             right=right.sum(),
@@ -95,20 +95,22 @@ def _count_per_piece(passes: pl.DataFrame, criteria: LineCriteria) -> pl.DataFra
             monitors=pl.col("monitor").drop_nulls(),
             **{f"lost_{loss.value}": (cause == loss.value).sum() for loss in LOSSES},
         )
-        .with_columns(pl.col("monitors").map_elements(_by_frequency, return_dtype=pl.String))
+        .with_columns(pl.col("monitors").map_elements(_most_frequent_first, return_dtype=pl.String))
         .join(hours, on=KEYS, how="left")
     )
 
 
-def _by_frequency(names: pl.Series) -> str:
+def _most_frequent_first(names: pl.Series) -> str:
     """Names once each, the most frequent first."""
     return " ".join(name for name, _ in sorted(Counter(names).items(), key=lambda item: (-item[1], item[0])))
 
 
-def _judged(counted: pl.DataFrame, criteria: LineCriteria) -> pl.DataFrame:
+def _classify(counted: pl.DataFrame, criteria: LineCriteria) -> pl.DataFrame:
     """Pieces with bounds, class and cause: what was not judged counts against each bound."""
     cases = counted.select(_TRIALS).unique()
-    rows = [_shown(bad, number, wrong, unjudged, criteria) for bad, number, wrong, unjudged in cases.iter_rows()]
+    rows = [
+        _bounds_of_passes(bad, number, wrong, unjudged, criteria) for bad, number, wrong, unjudged in cases.iter_rows()
+    ]
     shown = pl.DataFrame(rows, schema=_SHOWN, orient="row")
     judged = counted.join(pl.concat([cases, shown], how="horizontal"), on=_TRIALS, how="left", maintain_order="left")
     misleading = (pl.col("wrong_in_use") > 0) | (pl.col("claimed_wrongly") > 0)
@@ -124,21 +126,21 @@ def _judged(counted: pl.DataFrame, criteria: LineCriteria) -> pl.DataFrame:
     )
     return judged.with_columns(
         piece_class=piece_class,
-        cause=_cause(unsuitable, is_met, hours),
+        cause=_cause_expression(unsuitable, is_met, hours),
         passes_needed=pl.when(~unsuitable).then("passes_needed"),
     )
 
 
-def _shown(bad: int, number: int, wrong: int, unjudged: int, criteria: LineCriteria) -> tuple[object, ...]:
-    """The columns `_SHOWN` of so many passes."""
+def _bounds_of_passes(bad: int, number: int, wrong: int, unjudged: int, criteria: LineCriteria) -> tuple[object, ...]:
+    """Bounds, needed passes and findings of so many passes, in the order of `_SHOWN`."""
     lost = share_shown(bad, number, unjudged, criteria.loss_limit, criteria.confidence)
     unsafe = share_shown(wrong, number, unjudged, criteria.loss_limit, criteria.confidence)
     bounds = lost.bounds
     return bounds.value, bounds.low, bounds.high, unsafe.bounds.high, lost.needed, lost.finding.value
 
 
-def _cause(unsuitable: pl.Expr, shown: pl.Expr, hours: pl.Expr) -> pl.Expr:
-    """What speaks most against a piece, the first that applies."""
+def _cause_expression(unsuitable: pl.Expr, shown: pl.Expr, hours: pl.Expr) -> pl.Expr:
+    """Expression for what speaks most against a piece, the first that applies."""
     lost = pl.concat_list(f"lost_{loss.value}" for loss in LOSSES).list.arg_max()
     named = lost.replace_strict(dict(enumerate(loss.value for loss in LOSSES)), return_dtype=pl.String)
     few = named.is_in(SHORT_OF_SATELLITES) & (2 * pl.col("few_satellites") > pl.col("lost"))

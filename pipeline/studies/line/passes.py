@@ -7,7 +7,7 @@ import polars as pl
 from scipy.spatial import cKDTree
 
 from pipeline.results.places import ground_of, stretches_of
-from pipeline.studies.line.pieces import Pieces, plane_of
+from pipeline.studies.line.pieces import Pieces, places_in_plane_m
 from pipeline.studies.line.spans import FIRST_LOSS, SpanState, spans_of, states_of
 from schemas.arrays import Floats, Ints, floats
 from schemas.config import Configuration
@@ -49,13 +49,15 @@ class PieceIndex:
     tree: cKDTree
 
     @classmethod
-    def of(cls, site: Site, pieces: Pieces, middles_m: Floats) -> PieceIndex:
+    def of_pieces(cls, site: Site, pieces: Pieces, middles_m: Floats) -> PieceIndex:
         """The index over pieces with these middles [m]."""
         return cls(site, pieces, cKDTree(np.nan_to_num(middles_m, nan=1e12)))
 
-    def near(self, rows: pl.DataFrame, reach_m: float) -> Ints:
+    def pieces_near(self, rows: pl.DataFrame, reach_m: float) -> Ints:
         """Pieces within reach of the places of some epochs."""
-        place = plane_of(self.site, ground_of(self.site.track, rows["netelement_id"], floats(rows, "measure_m")))
+        place = places_in_plane_m(
+            self.site, ground_of(self.site.track, rows["netelement_id"], floats(rows, "measure_m"))
+        )
         place = place[np.isfinite(place).all(axis=1)]
         half_m = 0.5 * float((self.pieces.to_m - self.pieces.from_m).max())
         hits = self.tree.query_ball_point(place, float(np.hypot(reach_m, half_m)))
@@ -82,13 +84,16 @@ def passes_of(
     stretches = stretches_of(epochs)
     states = states_of(epochs, alarms["t_start"], config)
     spans = spans_of(epochs, states, stretches, config)
-    hits = laid_on(spans, stretches, ground.pieces)
-    parts = [_worst(hits, ground.pieces, criteria), _unsafe(passages, epochs, stretches, ground.pieces)]
-    parts += _misleading(epochs, states, stretches, ground, criteria)
-    return _explained(_merged(pl.concat(parts)), hits, alarms)
+    hits = spans_on_pieces(spans, stretches, ground.pieces)
+    parts = [
+        _worst_passes(hits, ground.pieces, criteria),
+        _unsafe_acceptances(passages, epochs, stretches, ground.pieces),
+    ]
+    parts += _misled_pieces(epochs, states, stretches, ground, criteria)
+    return _with_monitors(_merge_passes(pl.concat(parts)), hits, alarms)
 
 
-def laid_on(spans: pl.DataFrame, stretches: pl.DataFrame, pieces: Pieces) -> pl.DataFrame:
+def spans_on_pieces(spans: pl.DataFrame, stretches: pl.DataFrame, pieces: Pieces) -> pl.DataFrame:
     """The spans' columns per piece and direction that they touch, with `begin_m, end_m`: the likely stretch on the
     piece.
 
@@ -100,14 +105,14 @@ def laid_on(spans: pl.DataFrame, stretches: pl.DataFrame, pieces: Pieces) -> pl.
         element = pieces.track.index.get(name)
         if element is None:
             continue
-        at = _measures(spans, sign, offset_m)
+        at = _spans_as_measures(spans, sign, offset_m)
         rows = pieces.track.vertex_range(element)
         first_m = pieces.track.measure_m[rows][0]
         last_m = pieces.track.measure_m[rows][-1]
         on_element = pl.col("state").is_in(_ANYWHERE) | pl.col("elements").list.contains(name)
         kept = at.filter((pl.col("high") >= first_m) & (pl.col("low") <= last_m) & on_element.fill_null(value=False))
-        begin = pieces.at(element, floats(kept, "low"))
-        end = pieces.at(element, floats(kept, "high"))
+        begin = pieces.pieces_at(element, floats(kept, "low"))
+        end = pieces.pieces_at(element, floats(kept, "high"))
         index = np.repeat(np.arange(kept.height), end - begin + 1)
         # Number of each piece within its span.
         ahead = np.arange(len(index)) - np.repeat(np.cumsum(end - begin + 1) - (end - begin + 1), end - begin + 1)
@@ -116,11 +121,13 @@ def laid_on(spans: pl.DataFrame, stretches: pl.DataFrame, pieces: Pieces) -> pl.
         begin_m = np.maximum(floats(hit, "begin"), pieces.from_m[piece])
         end_m = np.minimum(floats(hit, "end"), pieces.to_m[piece])
         laid.append(hit.with_columns(begin_m=begin_m, end_m=end_m))
-    empty = _measures(spans.clear(), 1, 0.0).with_columns(piece=pl.lit(0), begin_m=pl.lit(0.0), end_m=pl.lit(0.0))
+    empty = _spans_as_measures(spans.clear(), 1, 0.0).with_columns(
+        piece=pl.lit(0), begin_m=pl.lit(0.0), end_m=pl.lit(0.0)
+    )
     return pl.concat(laid) if laid else empty
 
 
-def _measures(spans: pl.DataFrame, sign: int, offset_m: float) -> pl.DataFrame:
+def _spans_as_measures(spans: pl.DataFrame, sign: int, offset_m: float) -> pl.DataFrame:
     """Spans as measures of an element on which `path = offset + sign * measure`."""
     order = ("low_m", "high_m", "from_m", "to_m") if sign > 0 else ("high_m", "low_m", "to_m", "from_m")
     names = ("low", "high", "begin", "end")
@@ -128,7 +135,7 @@ def _measures(spans: pl.DataFrame, sign: int, offset_m: float) -> pl.DataFrame:
     return spans.select("state", "t", "elements", "satellites", growing=pl.col("direction") * sign > 0, **places)
 
 
-def _worst(hits: pl.DataFrame, pieces: Pieces, criteria: LineCriteria) -> pl.DataFrame:
+def _worst_passes(hits: pl.DataFrame, pieces: Pieces, criteria: LineCriteria) -> pl.DataFrame:
     """One row per piece and direction; a right one that covered too little of the piece is not counted."""
     worst = hits.group_by("piece", "growing").agg(
         state=pl.col("state").max(),
@@ -138,10 +145,10 @@ def _worst(hits: pl.DataFrame, pieces: Pieces, criteria: LineCriteria) -> pl.Dat
     length_m = (pieces.to_m - pieces.from_m)[worst["piece"].to_numpy()]
     short = (pl.col("state") == int(SpanState.RIGHT)) & (pl.col("covered_m") < criteria.coverage * pl.Series(length_m))
     state = pl.when(short).then(int(SpanState.NOT_COVERED)).otherwise(pl.col("state"))
-    return _rows(worst.with_columns(state=state))
+    return _with_cause(worst.with_columns(state=state))
 
 
-def _rows(frame: pl.DataFrame, cause: LineCause | None = None) -> pl.DataFrame:
+def _with_cause(frame: pl.DataFrame, cause: LineCause | None = None) -> pl.DataFrame:
     """Rows of `_OUTCOMES` with the cause that the state has, or another."""
     names = {int(state): code_of.value for state, code_of in CAUSES.items()}
     cause_of_state = pl.col("state").replace_strict(names, default=LineCause.NONE.value, return_dtype=pl.String)
@@ -152,7 +159,9 @@ def _rows(frame: pl.DataFrame, cause: LineCause | None = None) -> pl.DataFrame:
     )
 
 
-def _unsafe(passages: pl.DataFrame, epochs: pl.DataFrame, stretches: pl.DataFrame, pieces: Pieces) -> pl.DataFrame:
+def _unsafe_acceptances(
+    passages: pl.DataFrame, epochs: pl.DataFrame, stretches: pl.DataFrame, pieces: Pieces
+) -> pl.DataFrame:
     """Pieces of virtual balises that were accepted at a wrong place, in the direction in which the train went."""
     unsafe = passages.filter(
         (pl.col("status") == PassageStatus.ACCEPTED.value)
@@ -160,10 +169,10 @@ def _unsafe(passages: pl.DataFrame, epochs: pl.DataFrame, stretches: pl.DataFram
         & (pl.col("kind") == BaliseKind.VIRTUAL.value)
     ).with_columns(t=pl.coalesce("t_offered", "t_true"))
     there = unsafe.sort("t").join_asof(epochs.select("t", ahead="direction"), on="t")
-    return _rows(_named(there, stretches, pieces), LineCause.UNSAFE_ACCEPTANCE)
+    return _with_cause(_pieces_of_places(there, stretches, pieces), LineCause.UNSAFE_ACCEPTANCE)
 
 
-def _misleading(
+def _misled_pieces(
     epochs: pl.DataFrame, states: Ints, stretches: pl.DataFrame, ground: PieceIndex, criteria: LineCriteria
 ) -> list[pl.DataFrame]:
     """Pieces that wrong positions in use claimed, and those near a position on a wrong track."""
@@ -172,20 +181,20 @@ def _misleading(
     )
     track = pl.col("error_low_m").is_null()
     in_use = pl.col("state") == int(SpanState.WRONG_IN_USE)
-    claims = _named(placed.filter(in_use & ~track), stretches, ground.pieces)
-    parts = [_rows(claims, LineCause.CLAIMED_WRONGLY)]
+    claims = _pieces_of_places(placed.filter(in_use & ~track), stretches, ground.pieces)
+    parts = [_with_cause(claims, LineCause.CLAIMED_WRONGLY)]
     for state in (SpanState.WRONG_TRACK, SpanState.WRONG_IN_USE):
         rows = placed.filter(track & (pl.col("state") == int(state)))
         if rows.height:
             # On which of these tracks it was, and so in which direction over each, nobody knows.
-            piece = pl.DataFrame({"piece": ground.near(rows, criteria.beside_m)})
+            piece = pl.DataFrame({"piece": ground.pieces_near(rows, criteria.beside_m)})
             both = piece.join(pl.DataFrame({"growing": [True, False]}), how="cross")
             lone = both.with_columns(state=pl.lit(int(state)), t=pl.lit(rows["t"][0]))
-            parts.append(_rows(lone, LineCause.WRONG_TRACK))
+            parts.append(_with_cause(lone, LineCause.WRONG_TRACK))
     return parts
 
 
-def _named(rows: pl.DataFrame, stretches: pl.DataFrame, pieces: Pieces) -> pl.DataFrame:
+def _pieces_of_places(rows: pl.DataFrame, stretches: pl.DataFrame, pieces: Pieces) -> pl.DataFrame:
     """`piece, growing, state, t` of the places that rows name; `ahead`: their direction on growing path.
 
     Both directions where that is not known.
@@ -195,7 +204,7 @@ def _named(rows: pl.DataFrame, stretches: pl.DataFrame, pieces: Pieces) -> pl.Da
         signs.setdefault(name, set()).add(sign)
     first_times: dict[tuple[int, bool], object] = {}
     for name, at, ahead, t in rows.select("netelement_id", "measure_m", "ahead", "t").iter_rows():
-        if (piece := pieces.holding(name, at)) is None:
+        if (piece := pieces.piece_holding(name, at)) is None:
             continue
         senses = {sign * ahead > 0 for sign in signs.get(name, ())} if ahead in (1, -1) else set()
         for growing in senses or {True, False}:
@@ -205,7 +214,7 @@ def _named(rows: pl.DataFrame, stretches: pl.DataFrame, pieces: Pieces) -> pl.Da
     return pl.DataFrame(table, schema=schema, orient="row")
 
 
-def _merged(rows: pl.DataFrame) -> pl.DataFrame:
+def _merge_passes(rows: pl.DataFrame) -> pl.DataFrame:
     """One row per piece and direction: the worst state with its cause; a mere claim stands next to that."""
     claims = rows.filter("claimed").select("piece", "growing").unique().with_columns(has_claim=pl.lit(value=True))
     unclaimed = rows.filter(~pl.col("claimed"))
@@ -220,7 +229,7 @@ def _merged(rows: pl.DataFrame) -> pl.DataFrame:
     return pl.concat([kept, lone.with_columns(state=pl.lit(int(SpanState.NOT_COVERED)).cast(pl.Int64))])
 
 
-def _explained(passes: pl.DataFrame, hits: pl.DataFrame, alarms: pl.DataFrame) -> pl.DataFrame:
+def _with_monitors(passes: pl.DataFrame, hits: pl.DataFrame, alarms: pl.DataFrame) -> pl.DataFrame:
     """Passes with the monitor that failed first in an alarm on the piece, and the satellites at the worst place."""
     keys = ["piece", "growing"]
     worst = hits.filter(pl.col("state") == pl.col("state").max().over(keys)).group_by(keys).agg(pl.min("satellites"))

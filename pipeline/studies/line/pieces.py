@@ -22,27 +22,27 @@ class Pieces:
     from_m: Floats
     to_m: Floats
 
-    def at(self, element: int, measure_m: Floats) -> Ints:
+    def pieces_at(self, element: int, measure_m: Floats) -> Ints:
         """The piece that holds each measure; beyond an end the last one there."""
         last = int(self.first[element + 1]) - 1
         begin = int(self.first[element])
         piece = begin + np.searchsorted(self.from_m[begin : last + 1], measure_m, side="right") - 1
         return np.clip(piece, begin, last).astype(np.int64)
 
-    def holding(self, netelement_id: str | None, measure_m: float | None) -> int | None:
+    def piece_holding(self, netelement_id: str | None, measure_m: float | None) -> int | None:
         """The piece at a place; None without one, or on an element of another survey."""
         if netelement_id not in self.track.index or measure_m is None:
             return None
-        return int(self.at(self.track.index[netelement_id], np.array([measure_m]))[0])
+        return int(self.pieces_at(self.track.index[netelement_id], np.array([measure_m]))[0])
 
     @property
-    def middle_m(self) -> Floats:
+    def middle_measures_m(self) -> Floats:
         """Measure of the middle of each piece [m]."""
         middle: Floats = 0.5 * (self.from_m + self.to_m)
         return middle
 
     @property
-    def names(self) -> list[str]:
+    def element_names(self) -> list[str]:
         """Net element of each piece."""
         return [self.track.ids[number] for number in self.element]
 
@@ -59,11 +59,13 @@ def pieces_of(site: Site, piece_m: float) -> Pieces:
     return Pieces(track, first, element, begin_m + number * step_m, begin_m + (number + 1) * step_m)
 
 
-def middles(site: Site, pieces: Pieces) -> Floats:
+def middles_in_plane_m(site: Site, pieces: Pieces) -> Floats:
     """East and north of each piece's middle [m], `[piece, 2]`."""
-    return plane_of(site, ground_of(site.track, pl.Series(pieces.names, dtype=pl.String), pieces.middle_m))
+    return places_in_plane_m(
+        site, ground_of(site.track, pl.Series(pieces.element_names, dtype=pl.String), pieces.middle_measures_m)
+    )
 
 
-def plane_of(site: Site, ground: GroundPositions) -> Floats:
+def places_in_plane_m(site: Site, ground: GroundPositions) -> Floats:
     """Places as rows of east and north [m]."""
     return np.column_stack(plane_m(ground, origin_of(site)))

@@ -51,7 +51,7 @@ _PLACED: dict[str, pl.DataType | type[pl.DataType]] = {
 """A balise on a piece of a chain; `distance_m` from the one before, over the pieces `since` that one."""
 
 
-def proposals(line: LineEvidence) -> tuple[pl.DataFrame, pl.DataFrame]:
+def propose_balises(line: LineEvidence) -> tuple[pl.DataFrame, pl.DataFrame]:
     """`LineProposals` and `LineBalises`; none where no piece is suitable."""
     rows = []
     balises = [pl.DataFrame(schema=dtypes(LineBalises))]
@@ -59,19 +59,21 @@ def proposals(line: LineEvidence) -> tuple[pl.DataFrame, pl.DataFrame]:
     growing = np.ones(len(line.pieces.element), dtype=np.bool_)
     for chain in chains:
         growing[chain["piece"].to_numpy()] = chain["growing"].to_numpy()
-    near = _near(line)
+    near = _nearest_points(line)
     for mode, sides in MODES.items():
-        allowed = _allowed(line, sides, growing)
+        allowed = _are_allowed(line, sides, growing)
         if not allowed.any():
             continue
         for spacing_m in line.criteria.spacings_m:
             name = f"{mode}-{spacing_m:g}m"
             walked = [
-                row for chain in chains for row in _walk(chain, allowed, near["near_m"], spacing_m, line.criteria)
+                row
+                for chain in chains
+                for row in _place_along(chain, allowed, near["near_m"], spacing_m, line.criteria)
             ]
-            placed = _disjoint(line, _placed(line, walked, sides, near["near"]))
-            balises.append(_balises(line, name, placed))
-            rows.append(_figures(line, name, spacing_m, mode, placed, growing))
+            placed = _without_overlaps(line, _with_places(line, walked, sides, near["near"]))
+            balises.append(_balise_rows(line, name, placed))
+            rows.append(_proposal_figures(line, name, spacing_m, mode, placed, growing))
     table = pl.DataFrame(rows, schema=dtypes(LineProposals))
     return conform(table, LineProposals), conform(pl.concat(balises), LineBalises)
 
@@ -98,7 +100,7 @@ def site_balises(balises: pl.DataFrame, criteria: LineCriteria) -> pl.DataFrame:
     )
 
 
-def _allowed(line: LineEvidence, sides: Sequence[bool], growing: Bools) -> Bools:
+def _are_allowed(line: LineEvidence, sides: Sequence[bool], growing: Bools) -> Bools:
     """Pieces suitable in every one of these directions along their chains."""
     suitable = (line.table["piece_class"].cast(pl.String) == PieceClass.SUITABLE.value).to_numpy()
     rising = suitable[0::2]
@@ -117,7 +119,7 @@ def _chains(line: LineEvidence) -> list[pl.DataFrame]:
     while wanted:
         start = min(
             (2 * piece + side for piece in wanted for side in (0, 1)),
-            key=lambda oriented: _rank(network, oriented, wanted),
+            key=lambda oriented: _chain_order(network, oriented, wanted),
         )
         chains.append(
             pl.DataFrame(list(_chain(network, line.pieces, start, wanted)), schema=_CHAIN_COLUMNS, orient="row")
@@ -125,7 +127,7 @@ def _chains(line: LineEvidence) -> list[pl.DataFrame]:
     return chains
 
 
-def _rank(network: Network, oriented: int, wanted: set[int]) -> tuple[int, int]:
+def _chain_order(network: Network, oriented: int, wanted: set[int]) -> tuple[int, int]:
     """First those elements that nothing wanted leads to: ends of the line."""
     entries = sum(edge.to // 2 in wanted for edge in network.successors[oriented ^ 1])
     return min(entries, 1), oriented
@@ -142,20 +144,20 @@ def _chain(network: Network, pieces: Pieces, start: int, wanted: set[int]) -> It
         begin_m = float(pieces.from_m[numbers[0]])
         end_m = float(pieces.to_m[numbers[-1]])
         for number in reversed(numbers) if against else numbers:
-            middle_m = float(pieces.middle_m[number])
+            middle_m = float(pieces.middle_measures_m[number])
             yield number, entry_m + (end_m - middle_m if against else middle_m - begin_m), not against
         edges = [edge for edge in network.successors[oriented] if edge.to // 2 in wanted]
         entry_m += network.length_m(oriented) + (edges[0].gap_m if edges else 0.0)
         oriented = edges[0].to if edges else None
 
 
-def _near(line: LineEvidence) -> pl.DataFrame:
+def _nearest_points(line: LineEvidence) -> pl.DataFrame:
     """`near, near_m`: per piece the nearest station or signal of the same net element; else "" and infinite."""
     pieces = line.pieces
     names = np.full(len(pieces.element), "", dtype=object)
     nearest_m = np.full(len(pieces.element), np.inf)
     for name, element_name, measure_m in line.points.select("name", "netelement_id", "measure_m").iter_rows():
-        away_m = np.abs(pieces.middle_m - measure_m)
+        away_m = np.abs(pieces.middle_measures_m - measure_m)
         here = pieces.element == pieces.track.index[element_name]
         nearer = here & (away_m <= line.criteria.near_m) & (away_m < nearest_m)
         names[nearer] = name
@@ -163,7 +165,7 @@ def _near(line: LineEvidence) -> pl.DataFrame:
     return pl.DataFrame({"near": pl.Series(names.tolist(), dtype=pl.String), "near_m": nearest_m})
 
 
-def _walk(
+def _place_along(
     chain: pl.DataFrame, allowed: Bools, near_m: pl.Series, spacing_m: float, criteria: LineCriteria
 ) -> Iterator[tuple[object, ...]]:
     """Rows of `_PLACED`: at each step the best piece about a spacing on; where none is allowed a physical one.
@@ -189,7 +191,7 @@ def _walk(
         begun = True
 
 
-def _placed(
+def _with_places(
     line: LineEvidence, walked: Sequence[tuple[object, ...]], sides: Sequence[bool], near: pl.Series
 ) -> pl.DataFrame:
     """`_PLACED` with place, kind, the direction in which a virtual one serves its travel, and what it is near."""
@@ -198,8 +200,8 @@ def _placed(
     one_direction = pl.col("virtual") & (len(sides) == 1)
     along = pl.when(pl.col("growing") == sides[0]).then(pl.lit(BaliseDirection.AB.value))
     return placed.with_columns(
-        netelement_id=pl.Series([line.pieces.names[number] for number in piece], dtype=pl.String),
-        measure_m=np.round(line.pieces.middle_m[piece], 3),
+        netelement_id=pl.Series([line.pieces.element_names[number] for number in piece], dtype=pl.String),
+        measure_m=np.round(line.pieces.middle_measures_m[piece], 3),
         kind=pl.when("virtual").then(pl.lit(BaliseKind.VIRTUAL.value)).otherwise(pl.lit(BaliseKind.PHYSICAL.value)),
         direction=pl.when(one_direction)
         .then(along.otherwise(pl.lit(BaliseDirection.BA.value)))
@@ -208,7 +210,7 @@ def _placed(
     )
 
 
-def _disjoint(line: LineEvidence, placed: pl.DataFrame) -> pl.DataFrame:
+def _without_overlaps(line: LineEvidence, placed: pl.DataFrame) -> pl.DataFrame:
     """Without balises whose windows linking cannot tell apart, as where chains meet; the later one goes."""
     while True:
         # Announced in one list, whatever their kind.
@@ -225,11 +227,11 @@ def _disjoint(line: LineEvidence, placed: pl.DataFrame) -> pl.DataFrame:
         placed = placed.filter(balises["balise_id"] != gone)
 
 
-def _balises(line: LineEvidence, name: str, placed: pl.DataFrame) -> pl.DataFrame:
+def _balise_rows(line: LineEvidence, name: str, placed: pl.DataFrame) -> pl.DataFrame:
     """`LineBalises` of one proposal."""
     why = pl.format("{} {}: {}", "direction", "piece_class", "cause").str.join(", ")
     of_pieces = line.table.group_by("piece").agg(why=why, error_m=pl.col("largest_undetected_m").max()).sort("piece")
-    proved = _allowed(line, MODES["both"], np.ones(len(line.pieces.element), dtype=np.bool_))
+    proved = _are_allowed(line, MODES["both"], np.ones(len(line.pieces.element), dtype=np.bool_))
     virtual = pl.col("virtual")
     number = pl.int_range(1, pl.len() + 1).over("virtual").cast(pl.String).str.zfill(3)
     errors = [of_pieces["error_m"].gather(since).max() for since in placed["since"]]
@@ -243,7 +245,7 @@ def _balises(line: LineEvidence, name: str, placed: pl.DataFrame) -> pl.DataFram
     ).select(pl.col(column).cast(dtype) for column, dtype in dtypes(LineBalises).items())
 
 
-def _figures(
+def _proposal_figures(
     line: LineEvidence, name: str, spacing_m: float, mode: str, placed: pl.DataFrame, growing: Bools
 ) -> dict[str, object]:
     """The figures of one proposal, as a row of the result."""

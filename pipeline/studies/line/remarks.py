@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import polars as pl
 
-from pipeline.studies.reservations import runs_without_truth, sentences, several_settings
+from pipeline.studies.reservations import reservation_sentences, runs_without_truth, several_settings
 from pipeline.studies.tally import trials_needed
 from schemas.line import LineCriteria, LineDirection
 from schemas.words import say
@@ -13,7 +13,7 @@ from schemas.words import say
 _NAMED = 8
 
 
-def remarks(
+def line_remarks(
     runs: pl.DataFrame, passes: pl.DataFrame, table: pl.DataFrame, figures: pl.DataFrame, criteria: LineCriteria
 ) -> list[str]:
     """Sentences for people, the gravest limits first."""
@@ -36,15 +36,18 @@ def remarks(
     }
     return [
         *runs_without_truth(runs, say("line", "blind")),
-        *sentences("line", numbers),
-        *_sides(table),
+        *reservation_sentences("line", numbers),
+        *_one_sided_remarks(table),
         *several_settings(runs, say("line", "trains")),
-        *sentences("line", rest),
+        *reservation_sentences("line", rest),
     ]
 
 
-def _sides(table: pl.DataFrame) -> list[str]:
-    """Net elements that runs passed in one direction only; a wrong track condemns both, whichever was run."""
+def _one_sided_remarks(table: pl.DataFrame) -> list[str]:
+    """Sentences on net elements that runs passed in one direction only.
+
+    A wrong track condemns both directions, whichever was run.
+    """
     run = table.filter(pl.col("passes") > pl.col("lost_wrong_track"))
     sides = run.group_by("netelement_id", maintain_order=True).agg(pl.col("direction").unique())
     said = []

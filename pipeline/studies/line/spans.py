@@ -40,7 +40,7 @@ EPOCH_COLUMNS = (
 def states_of(epochs: pl.DataFrame, alarm_starts: pl.Series, config: Configuration) -> Ints:
     """`SpanState` per epoch of one solution. An alarm counts where it begins; what it blocks after that does not."""
     in_use = flags(epochs, "in_use")
-    wrong = _is(epochs, "wrong")
+    wrong = _have_judgement(epochs, "wrong")
     starts = epochs["t"].is_in(alarm_starts.implode()).to_numpy()
     conditions = [
         (wrong & in_use, SpanState.WRONG_IN_USE),
@@ -51,7 +51,7 @@ def states_of(epochs: pl.DataFrame, alarm_starts: pl.Series, config: Configurati
         (~holds(epochs, confident(config)), SpanState.CONFIDENCE),
         (starts, SpanState.ALARM),
         (~in_use, SpanState.AFTER_ALARM),
-        (_is(epochs, "right"), SpanState.RIGHT),
+        (_have_judgement(epochs, "right"), SpanState.RIGHT),
     ]
     states = np.select(
         [condition for condition, _ in conditions], [int(state) for _, state in conditions], int(SpanState.UNKNOWN)
@@ -59,7 +59,7 @@ def states_of(epochs: pl.DataFrame, alarm_starts: pl.Series, config: Configurati
     return states.astype(np.int64)
 
 
-def _is(epochs: pl.DataFrame, judgement: str) -> Bools:
+def _have_judgement(epochs: pl.DataFrame, judgement: str) -> Bools:
     """Which epochs have a judgement."""
     return (epochs["judgement"].cast(pl.String) == judgement).fill_null(value=False).to_numpy()
 
@@ -89,7 +89,7 @@ def spans_of(epochs: pl.DataFrame, states: Ints, stretches: pl.DataFrame, config
         elements = _elements_between(
             stretches, min(low[here[row]], low[there[row]]), max(high[here[row]], high[there[row]])
         )
-        state[row] = _between(state[row], states[inner], possible[inner], elements)
+        state[row] = _inner_state(state[row], states[inner], possible[inner], elements)
     apart = in_gap | (there > here + 1)
     ends = np.unique(np.concatenate([here[apart], there[apart]]))
     ends = ends[states[ends] >= SpanState.WRONG]
@@ -106,7 +106,7 @@ def spans_of(epochs: pl.DataFrame, states: Ints, stretches: pl.DataFrame, config
             "direction": epochs["direction"].gather(there),
             "state": state,
             "t": epochs["t"].gather(here),
-            "elements": _elements(possible, here, there),
+            "elements": _possible_elements(possible, here, there),
             "satellites": pl.Series(np.fmin(satellites[here], satellites[there]), nan_to_null=True),
         }
     )
@@ -117,7 +117,7 @@ def _elements_between(stretches: pl.DataFrame, begin_m: float, end_m: float) -> 
     return set(stretches.filter((pl.col("last_m") >= begin_m) & (pl.col("first_m") <= end_m))["netelement_id"])
 
 
-def _between(ends: int, inner: Ints, possible: list[list[str] | None], elements: set[str]) -> int:
+def _inner_state(ends: int, inner: Ints, possible: list[list[str] | None], elements: set[str]) -> int:
     """What is known of a stretch whose inner epochs have no known place; `ends`: the worse of its two ends."""
     if (inner == SpanState.OUTAGE).all():
         return int(SpanState.OUTAGE)
@@ -126,7 +126,7 @@ def _between(ends: int, inner: Ints, possible: list[list[str] | None], elements:
     return int(SpanState.UNKNOWN)
 
 
-def _elements(possible: list[list[str] | None], here: Ints, there: Ints) -> pl.Series:
+def _possible_elements(possible: list[list[str] | None], here: Ints, there: Ints) -> pl.Series:
     """Net elements on which the train may have been from one epoch to the other."""
     pairs = zip(here.tolist(), there.tolist(), strict=True)
     names_of_spans = [

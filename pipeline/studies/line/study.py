@@ -10,11 +10,11 @@ from pipeline.results.store import check_site, complete_runs, completed_runs, re
 from pipeline.results.workers import with_progress
 from pipeline.studies.line.classes import piece_classes
 from pipeline.studies.line.passes import PieceIndex, passes_of
-from pipeline.studies.line.pieces import Pieces, middles, pieces_of
-from pipeline.studies.line.proposals import LineEvidence, proposals
-from pipeline.studies.line.remarks import remarks
+from pipeline.studies.line.pieces import Pieces, middles_in_plane_m, pieces_of
+from pipeline.studies.line.proposals import LineEvidence, propose_balises
+from pipeline.studies.line.remarks import line_remarks
 from pipeline.studies.line.spans import EPOCH_COLUMNS, SpanState
-from pipeline.studies.tally import distinct
+from pipeline.studies.tally import without_repeated_journeys
 from schemas.config import Configuration
 from schemas.enums import Evidence
 from schemas.errors import InputError, UsageError
@@ -65,15 +65,15 @@ def study_line(
     Raises:
         UsageError: the result is of another site.
     """
-    runs, twice = distinct(_runs(out, site, solution))
+    runs, twice = without_repeated_journeys(_runs_of_solution(out, site, solution))
     pieces = pieces_of(site, criteria.piece_m)
-    ground = PieceIndex.of(site, pieces, middles(site, pieces))
+    ground = PieceIndex.of_pieces(site, pieces, middles_in_plane_m(site, pieces))
     passes, undetected = passes_of_runs(out, runs, ground, criteria)
     table = piece_classes(passes, undetected, pieces, criteria)
     lds = (read_config(out) or Configuration()).lds
     line = LineEvidence(site, pieces, table, passes, _known_points(points, pieces), criteria, lds)
-    figures, balises = proposals(line)
-    return LineResult(line, figures, balises, (*twice, *remarks(runs, passes, table, figures, criteria)))
+    figures, balises = propose_balises(line)
+    return LineResult(line, figures, balises, (*twice, *line_remarks(runs, passes, table, figures, criteria)))
 
 
 def read_points(path: Path) -> pl.DataFrame:
@@ -98,7 +98,7 @@ def read_points(path: Path) -> pl.DataFrame:
         ) from None
 
 
-def _runs(out: Path, site: Site, solution: str | None) -> pl.DataFrame:
+def _runs_of_solution(out: Path, site: Site, solution: str | None) -> pl.DataFrame:
     """Rows of `runs` of the solution asked for, those that did not fail; every run is of this site."""
     names = complete_runs(out)
     for run, metadata in completed_runs(out).items():
@@ -129,14 +129,14 @@ def passes_of_runs(
             # Reads and odometers tell by where they are, not by how good positions are: what they miss hides nothing.
             passes = passes.with_columns(pl.col("state").replace(int(SpanState.UNKNOWN), int(SpanState.NOT_COVERED)))
         parts.append(passes.with_columns(run_id=pl.lit(run)))
-        errors.append(_undetected(passages, ground.pieces))
+        errors.append(_undetected_by_piece(passages, ground.pieces))
     return pl.concat(parts), pl.concat(errors).group_by("piece").agg(pl.col("largest_undetected_m").max())
 
 
-def _undetected(passages: pl.DataFrame, pieces: Pieces) -> pl.DataFrame:
+def _undetected_by_piece(passages: pl.DataFrame, pieces: Pieces) -> pl.DataFrame:
     """Largest undetected error at balises, by piece; empty where it was not computed."""
     largest_m = pl.max_horizontal(pl.col("undetected_ahead_m").abs(), pl.col("undetected_behind_m").abs())
-    piece = [pieces.holding(*place) for place in passages.select("netelement_id", "measure_m").iter_rows()]
+    piece = [pieces.piece_holding(*place) for place in passages.select("netelement_id", "measure_m").iter_rows()]
     return passages.select(piece=pl.Series(piece, dtype=pl.Int64), largest_undetected_m=largest_m).drop_nulls()
 
 

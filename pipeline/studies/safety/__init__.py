@@ -13,7 +13,7 @@ from pipeline.studies.safety.budget import (
     allocation_table,
     allowed_table,
     demands_table,
-    published,
+    published_table,
     substantiation_table,
     tolerable_table,
 )
@@ -46,5 +46,5 @@ def safety_tables(config: SafetyConfig) -> dict[str, pl.DataFrame]:
         "continuity": continuity_table(),
         "substantiation": substantiation_table(config),
         # What is printed wrongly (`misprint`), lost or left open in the papers, and what stands here instead.
-        "errata": published("errata"),
+        "errata": published_table("errata"),
     }

@@ -10,7 +10,7 @@ import math
 import polars as pl
 
 from pipeline.stages.run_row.bounds import continuity_over
-from pipeline.studies.safety.budget import S_PER_H, Figure, each, levels_table
+from pipeline.studies.safety.budget import S_PER_H, Figure, combine_values, levels_table
 from pipeline.studies.safety.markov import lds_hazard_rate_per_h
 from schemas.config import SafetyConfig
 
@@ -44,7 +44,7 @@ def architectures_table(config: SafetyConfig) -> pl.DataFrame:
     TVB section 2: 400 m between balises on average, 2500 m at most.
     """
     speeds_kmh = (40.0, 80.0, 120.0, 160.0, 200.0, 300.0)
-    table = each(levels_table(config), spacing_m=(400.0, 2000.0, 2500.0), speed_kmh=speeds_kmh)
+    table = combine_values(levels_table(config), spacing_m=(400.0, 2000.0, 2500.0), speed_kmh=speeds_kmh)
     rate = pl.col("rate")
     detect_s = pl.col("detect_s")
     link_s = pl.col("linking_time_s")

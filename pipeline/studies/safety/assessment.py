@@ -15,7 +15,7 @@ from pipeline.results.figures.map_errors import map_suspects
 from pipeline.results.manifest import NAME, read_manifest
 from pipeline.results.workers import with_progress
 from pipeline.storage.address import Address, join
-from pipeline.studies.safety.sensitivity import Replay, sensitivity
+from pipeline.studies.safety.sensitivity import Replay, vary_keys
 from pipeline.studies.safety.sentences import (
     level_statements,
     plain_statements,
@@ -24,7 +24,7 @@ from pipeline.studies.safety.sentences import (
     verdict_statement,
 )
 from pipeline.studies.safety.side_by_side import EPOCH_COLUMNS, side_by_side
-from pipeline.studies.safety.tally import added, architecture_figures
+from pipeline.studies.safety.tally import add_counts, architecture_figures
 from schemas.config import Configuration
 from schemas.enums import TRUTH, RunStatus, ThrVerdict
 from schemas.frozen import frozen
@@ -63,14 +63,14 @@ def assess(out: Address, config: Configuration | None = None, replay: Replay | N
     of_runs = compare_architectures(out, runs, hazards, alarms, settings)
     tables = {
         "sources": source_files(out),
-        "sensitivity": sensitivity(runs, settings, replay),
+        "sensitivity": vary_keys(runs, settings, replay),
         "figures": derived["figures"],
         "time_to_detect": derived["detection"],
         "levels": levels_summary(derived["levels"]),
         "levels_of_runs": derived["levels"],
         "accuracy": derived["accuracy"],
-        "side_by_side": architecture_figures(added(of_runs.values())),
-        "side_by_side_of_runs": by_run(of_runs),
+        "side_by_side": architecture_figures(add_counts(of_runs.values())),
+        "side_by_side_of_runs": architectures_by_run(of_runs),
         "alarms": alarm_causes(alarms, settings.hazards.map_reach_m),
         "map": derived["map"],
     }
@@ -98,7 +98,7 @@ def compare_architectures(
     return compared
 
 
-def by_run(counts_of_runs: Mapping[str, pl.DataFrame]) -> pl.DataFrame:
+def architectures_by_run(counts_of_runs: Mapping[str, pl.DataFrame]) -> pl.DataFrame:
     """The architectures of each run, one run below the other."""
     parts = [
         architecture_figures(counts).insert_column(0, pl.lit(run).alias("run_id"))
@@ -147,14 +147,14 @@ def source_files(out: Address) -> pl.DataFrame:
     made = {(run["software"], run["software_digest"]) for run in manifest["runs"].values()}
     rows += [("program", "", software or "", None, digest or "") for software, digest in sorted(made, key=str)]
     for entries in manifest["settings"].values():
-        rows += [_row(kind, "", file) for entry in entries for kind, file in entry.items() if file]
+        rows += [_file_row(kind, "", file) for entry in entries for kind, file in entry.items() if file]
     for listed in manifest["sites"].values():
-        rows += [_row("site", "", file) for file in listed]
+        rows += [_file_row("site", "", file) for file in listed]
     for run_id, run in manifest["runs"].items():
-        rows += [_row("log", run_id, file) for file in run["log"]]
+        rows += [_file_row("log", run_id, file) for file in run["log"]]
     return pl.DataFrame(rows, schema=SOURCES, orient="row").unique(maintain_order=True)
 
 
-def _row(kind: str, of: str, file: dict[str, Any]) -> tuple[str, str, str, int, str]:
+def _file_row(kind: str, of: str, file: dict[str, Any]) -> tuple[str, str, str, int, str]:
     """A file that the assessment rests on, as a row."""
     return kind, of, file["name"], file["bytes"], file["sha256"]

@@ -21,7 +21,7 @@ S_PER_H = 3600.0
 
 
 @cache
-def published(name: str, *figures: str) -> pl.DataFrame:
+def published_table(name: str, *figures: str) -> pl.DataFrame:
     """A table that the papers print, from its file next to this one; text except for `figures`."""
     table = pl.read_csv((files("pipeline.studies.safety") / f"{name}.csv").read_bytes(), infer_schema=False)
     return table.cast(dict.fromkeys(figures, pl.Float64)).with_columns(pl.col(pl.String).fill_null(""))
@@ -29,7 +29,7 @@ def published(name: str, *figures: str) -> pl.DataFrame:
 
 def allocation_table(config: SafetyConfig) -> pl.DataFrame:
     """How the ETCS core THR comes down to the virtual balise; `thr_per_h` [1/h]."""
-    table = published("allocation", "thr_per_h")
+    table = published_table("allocation", "thr_per_h")
     return table.with_columns(pl.col("thr_per_h").fill_null(config.thr_vb_per_h))
 
 
@@ -40,8 +40,8 @@ def levels_table(config: SafetyConfig) -> pl.DataFrame:
     return table.with_columns(detect_s=allowed_time_to_detect_s(config.thr_vb_per_h, pl.col("rate")))
 
 
-def each(table: pl.DataFrame, **values: Sequence[float]) -> pl.DataFrame:
-    """Every row with every combination of some values."""
+def combine_values(table: pl.DataFrame, **values: Sequence[float]) -> pl.DataFrame:
+    """Every row of a table with every combination of some values."""
     for name, listed in values.items():
         table = table.join(pl.DataFrame({name: listed}), how="cross", maintain_order="left_right")
     return table
@@ -101,7 +101,7 @@ def allowed_table(config: SafetyConfig, period_s: float = 0.1, negation_s: float
 
 def demands_table(config: SafetyConfig) -> pl.DataFrame:
     """What is left of the allowed time [s] when every VB passed in an hour is a demand."""
-    table = each(levels_table(config), speed_kmh=(80.0, 160.0, 300.0), spacing_m=(400.0, 2000.0, 2500.0))
+    table = combine_values(levels_table(config), speed_kmh=(80.0, 160.0, 300.0), spacing_m=(400.0, 2000.0, 2500.0))
     demands = demands_per_hour(pl.col("speed_kmh"), pl.col("spacing_m"))
     allowed_s = allowed_time_to_detect_s(config.thr_vb_per_h, pl.col("rate") * pl.col("demands_per_hour"))
     return (

@@ -39,18 +39,18 @@ def faults_of_pair(first: pl.DataFrame, second: pl.DataFrame) -> pl.DataFrame:
 
 def _mark_common(faults: pl.DataFrame, others: pl.DataFrame) -> pl.DataFrame:
     """`faults`, `common` where both they and one of the others at the same time are failures."""
-    spans = _spans(faults).with_columns(pl.col("end").fill_null(_OPEN_END_NS)).rows()
-    failed = _spans(others.filter("failed"))
-    coincides = pl.Series([_any_meets(failed, *span) for span in spans], dtype=pl.Boolean)
+    spans = _spans_ns(faults).with_columns(pl.col("end").fill_null(_OPEN_END_NS)).rows()
+    failed = _spans_ns(others.filter("failed"))
+    coincides = pl.Series([_overlaps_any(failed, *span) for span in spans], dtype=pl.Boolean)
     return faults.with_columns(common=pl.col("failed") & coincides)
 
 
-def _spans(faults: pl.DataFrame, begin: str = "begin") -> pl.DataFrame:
+def _spans_ns(faults: pl.DataFrame, begin: str = "begin") -> pl.DataFrame:
     """`begin, end` of faults or alarms [ns]; an end that is open is null."""
     return faults.select(begin=pl.col(begin).to_physical(), end=pl.col("t_end").to_physical())
 
 
-def _any_meets(spans: pl.DataFrame, begin_ns: int, last_ns: int) -> bool:
+def _overlaps_any(spans: pl.DataFrame, begin_ns: int, last_ns: int) -> bool:
     """One of the spans, which may be open, lies at least in part between these instants."""
     meets = (pl.col("begin") <= last_ns) & (pl.col("end").is_null() | (pl.col("end") >= begin_ns))
     return spans.filter(meets).height > 0
@@ -60,7 +60,7 @@ def fault_counts(faults: pl.DataFrame, fails: FailureLog) -> dict[str, object]:
     """Counts of `pipeline.studies.safety.tally`; those of common faults only where `faults` has `common`."""
     last = int(fails.t_ns[-1])
     kind = faults.schema["begin"]
-    ends = _spans(faults).with_columns(pl.col("end").fill_null(last)).rows()
+    ends = _spans_ns(faults).with_columns(pl.col("end").fill_null(last)).rows()
     detected_ns = [_detected_ns(fails, *span) for span in ends]
     failed = pl.col("failed")
     missed = pl.col("missed")
@@ -105,25 +105,25 @@ def verdict_of_both(alarm: AlarmEpisode, sides: tuple[SolutionTables, SolutionTa
 
     The rule of the `alarms` table (DOMAIN section 5.3), asked of both solutions.
     """
-    verdicts = {_of_side(alarm, side, config) for side in sides}
+    verdicts = {_verdict_of_side(alarm, side, config) for side in sides}
     return next(verdict for verdict in (Verdict.TRUE, Verdict.UNKNOWN, Verdict.FALSE) if verdict in verdicts)
 
 
-def _of_side(alarm: AlarmEpisode, side: SolutionTables, config: HazardConfig) -> Verdict:
+def _verdict_of_side(alarm: AlarmEpisode, side: SolutionTables, config: HazardConfig) -> Verdict:
     """The verdict of an alarm by the errors of one solution while it stood, and shortly before."""
     since_ns = alarm.start_ns - round(config.false_alarm_lookback_s * NS_PER_S)
     part = side.epochs.filter(pl.col("t").to_physical().is_between(since_ns, alarm.end_ns))
     known = part.filter(pl.col("path_m").is_not_null())
     low_m, high_m, sigma_m = (floats(known, name) for name in ("error_low_m", "error_high_m", "sigma_along_m"))
-    if _known_wrong(alarm, side):
+    if _is_known_wrong(alarm, side):
         return Verdict.TRUE
     return verdict_of_intervals(
         low_m, high_m, healthy_margins_m(sigma_m, config), np.full(known.height, side.with_truth)
     )
 
 
-def _known_wrong(alarm: AlarmEpisode, side: SolutionTables) -> bool:
-    """The replay found a fault at that time, or called an alarm then true."""
+def _is_known_wrong(alarm: AlarmEpisode, side: SolutionTables) -> bool:
+    """Whether the replay found a fault at that time, or called an alarm then true."""
     true = side.alarms.filter(pl.col("verdict").cast(pl.String) == Verdict.TRUE.value)
-    spans = pl.concat([_spans(side.faults), _spans(true, "t_start")])
-    return _any_meets(spans, alarm.start_ns, alarm.end_ns)
+    spans = pl.concat([_spans_ns(side.faults), _spans_ns(true, "t_start")])
+    return _overlaps_any(spans, alarm.start_ns, alarm.end_ns)

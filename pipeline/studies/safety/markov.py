@@ -43,18 +43,18 @@ class StateProbabilities:
     p3: float
 
 
-def exact(model: LdsModel, t_h: float) -> StateProbabilities:
+def exact_probabilities(model: LdsModel, t_h: float) -> StateProbabilities:
     """Probabilities after `t_h` hours, started in P0: P1 is TVB eq. 1 in a form that does not cancel."""
     leave = model.hr_sbas_per_h + model.hr_diag_per_h
     p0 = math.exp(-leave * t_h)
     left = -math.expm1(-leave * t_h)
-    p1 = model.hr_sbas_per_h * p0 * _growth(model.mu_per_h - leave, t_h)
+    p1 = model.hr_sbas_per_h * p0 * _integrated_decay_h(model.mu_per_h - leave, t_h)
     p3 = model.hr_diag_per_h / leave * left
     p2 = model.hr_sbas_per_h / leave * left - p1
     return StateProbabilities(p0, p1, max(0.0, p2), p3)
 
 
-def _growth(rate_per_h: float, t_h: float) -> float:
+def _integrated_decay_h(rate_per_h: float, t_h: float) -> float:
     """(1 - exp(-rate t)) / rate, with its limit t at rate 0."""
     return -math.expm1(-rate_per_h * t_h) / rate_per_h if rate_per_h != 0.0 else t_h
 
@@ -66,10 +66,10 @@ def approximate_p1(model: LdsModel) -> float:
 
 def approximation_error(model: LdsModel, t_h: float) -> float:
     """Relative error of eq. 2 against eq. 1: +0.58 at t = T_D, where P1 has reached 63 % of it."""
-    return approximate_p1(model) / exact(model, t_h).p1 - 1.0
+    return approximate_p1(model) / exact_probabilities(model, t_h).p1 - 1.0
 
 
-def generator(model: LdsModel) -> NDArray[np.float64]:
+def generator_matrix(model: LdsModel) -> NDArray[np.float64]:
     """Rates from row state to column state [1/h]; rows sum to zero."""
     rates = np.zeros((4, 4))
     rates[0, 1] = model.hr_sbas_per_h
@@ -79,12 +79,12 @@ def generator(model: LdsModel) -> NDArray[np.float64]:
     return rates
 
 
-def numeric(model: LdsModel, t_h: float) -> StateProbabilities:
+def numeric_probabilities(model: LdsModel, t_h: float) -> StateProbabilities:
     """The model solved from its generator alone, as a check on the formulas."""
     from scipy.linalg import expm
 
     # p(t) = p(0) exp(Q t) with p(0) = (1, 0, 0, 0): the first row of the matrix exponential.
-    row = expm(generator(model) * t_h)[0]
+    row = expm(generator_matrix(model) * t_h)[0]
     return StateProbabilities(*(float(value) for value in row))
 
 
@@ -105,8 +105,8 @@ def markov_table(config: SafetyConfig) -> pl.DataFrame:
 
 def _markov_row(level: str, model: LdsModel, t_h: float, thr_per_h: float) -> dict[str, object]:
     """The model of one service level, solved in closed form and numerically."""
-    state = exact(model, t_h)
-    solved = numeric(model, t_h)
+    state = exact_probabilities(model, t_h)
+    solved = numeric_probabilities(model, t_h)
     difference = max(abs(a - b) for a, b in zip(astuple(state), astuple(solved), strict=True))
     return {
         "service_level": level,

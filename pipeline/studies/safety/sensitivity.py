@@ -29,7 +29,7 @@ Row = dict[str, Any]
 Replay = Callable[[Configuration, str], object]
 
 
-def sensitivity(runs: pl.DataFrame, config: Configuration, replay: Replay | None = None) -> pl.DataFrame:
+def vary_keys(runs: pl.DataFrame, config: Configuration, replay: Replay | None = None) -> pl.DataFrame:
     """One row per key of `[hazards]` and value: runs by verdict, wrong acceptances, failures beyond the time allowed.
 
     `how` says where a row comes from. `replay` replays the logs with a configuration into a folder; without it the rows
@@ -40,14 +40,14 @@ def sensitivity(runs: pl.DataFrame, config: Configuration, replay: Replay | None
     for level in config.safety.service_levels:
         allowed_s = config.safety.allowed_time_to_detect_s(level)
         name = f"{level} ({allowed_s:.4g} s)" + (", configured" if level == used else "")
-        rows.append(_row("service_level", name, at_level(runs, allowed_s, config), _TABLES))
+        rows.append(_sensitivity_row("service_level", name, runs_at_level(runs, allowed_s, config), _TABLES))
     for key, shares in _VARIED.items():
         for value in sorted(round(share * getattr(config.hazards, key), 6) for share in (*shares, 1.0)):
-            rows.append(_varied(runs, config, key, value, replay))
+            rows.append(_vary_key(runs, config, key, value, replay))
     return pl.DataFrame(rows, schema=_SCHEMA)
 
 
-def at_level(runs: pl.DataFrame, allowed_s: float, config: Configuration) -> pl.DataFrame:
+def runs_at_level(runs: pl.DataFrame, allowed_s: float, config: Configuration) -> pl.DataFrame:
     """The `runs` rows as they would be with another allowed time: failures within and beyond it, and the verdict."""
     return pl.DataFrame(
         [_with_allowed(row, allowed_s, config) for row in runs.iter_rows(named=True)],
@@ -65,20 +65,20 @@ def _with_allowed(row: Row, allowed_s: float, config: Configuration) -> Row:
     return {**counted, "reasons": reasons, "verdict": verdict_of(reasons).value}
 
 
-def _varied(runs: pl.DataFrame, config: Configuration, key: str, value: float, replay: Replay | None) -> Row:
+def _vary_key(runs: pl.DataFrame, config: Configuration, key: str, value: float, replay: Replay | None) -> Row:
     """One key of `[hazards]` at one value."""
     if value == getattr(config.hazards, key):
-        return _row(key, f"{value:g}, configured", runs, _TABLES)
+        return _sensitivity_row(key, f"{value:g}, configured", runs, _TABLES)
     if replay is None:
         return {"key": key, "value": f"{value:g}", "how": _NEEDED}
     changed = config.model_copy(update={"hazards": config.hazards.model_copy(update={key: value})})
     with tempfile.TemporaryDirectory(prefix="balise-safety-") as folder:
         replay(changed, folder)
         again = store.read_table(folder, "runs").collect()
-    return _row(key, f"{value:g}", again, _REPLAYED)
+    return _sensitivity_row(key, f"{value:g}", again, _REPLAYED)
 
 
-def _row(key: str, value: str, runs: pl.DataFrame, how: str) -> Row:
+def _sensitivity_row(key: str, value: str, runs: pl.DataFrame, how: str) -> Row:
     """Verdict and counts over all runs, for one value of a key."""
     head = head_of(run_verdicts(runs).values())
     counts = {name: int(runs[name].sum()) for name in _COUNTS}

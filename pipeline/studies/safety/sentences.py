@@ -5,7 +5,7 @@ from __future__ import annotations
 import polars as pl
 
 from pipeline.results.figures.head import head_of, run_verdicts, verdict_figures
-from pipeline.studies.reservations import failed_runs, sentences, several_settings
+from pipeline.studies.reservations import failed_runs, reservation_sentences, several_settings
 from schemas.enums import RunStatus, Verdict
 from schemas.words import say, say_of, verdict_figures_words
 
@@ -26,15 +26,15 @@ def reservations(runs: pl.DataFrame, alarms: pl.DataFrame) -> list[str]:
     injected = runs.filter(pl.col("faults_injected").fill_null(value=False))["run_id"].n_unique()
     partial = runs.filter(pl.col("status") == RunStatus.PARTIAL)["run_id"].n_unique()
     return [
-        *sentences("safety", {"injected": injected and (injected, number)}),
+        *reservation_sentences("safety", {"injected": injected and (injected, number)}),
         *failed_runs(runs),
-        *sentences("safety", {"partial": partial and (partial, number)}),
+        *reservation_sentences("safety", {"partial": partial and (partial, number)}),
         *several_settings(runs, say("safety", "limits")),
-        *_unjudged(runs, alarms),
+        *_unjudged_sentences(runs, alarms),
     ]
 
 
-def _unjudged(runs: pl.DataFrame, alarms: pl.DataFrame) -> list[str]:
+def _unjudged_sentences(runs: pl.DataFrame, alarms: pl.DataFrame) -> list[str]:
     """Time and alarms of each solution that nothing could judge."""
     said = []
     done = runs.filter(pl.col("status") != RunStatus.FAILED).sort("solution")
@@ -45,7 +45,9 @@ def _unjudged(runs: pl.DataFrame, alarms: pl.DataFrame) -> list[str]:
         doubtful = (solution, unknown.height, unknown["run_id"].n_unique())
         # Less than a second is not worth saying.
         worth = held_h - judged_h >= 1.0 / 3600.0
-        said += sentences("safety", {"unchecked_time": worth and time, "unchecked_alarms": unknown.height and doubtful})
+        said += reservation_sentences(
+            "safety", {"unchecked_time": worth and time, "unchecked_alarms": unknown.height and doubtful}
+        )
     return said
 
 
@@ -84,5 +86,5 @@ def plain_statements(figures: pl.DataFrame) -> list[str]:
             "not_blocked": row["share_p1"],
             "proved" if proved else "not_proved": row,
         }
-        paragraphs.append(" ".join(sentences("safety", said)))
+        paragraphs.append(" ".join(reservation_sentences("safety", said)))
     return paragraphs

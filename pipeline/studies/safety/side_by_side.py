@@ -11,7 +11,6 @@ from itertools import combinations
 
 import numpy as np
 import polars as pl
-from schemas.monitors import ALL_MONITORS
 
 from pipeline.stages.epochs.clock import Clock, held_s, holds, may_move, nominal_period_s, position_ns, trusted, uptime
 from pipeline.stages.epochs.verdicts import FailureLog, Verdicts, failure_log
@@ -24,6 +23,7 @@ from schemas.arrays import NS_PER_S, Bools
 from schemas.config import Configuration
 from schemas.enums import TRUTH, Judgement, MonitorState, RunStatus, Verdict
 from schemas.frozen import frozen
+from schemas.monitors import ALL_MONITORS
 
 Row = dict[str, object]
 
@@ -77,17 +77,17 @@ def side_by_side(
         LOC section III, Fig. 3 and 4; LOC eq. 11.
     """
     names = sorted(runs.filter(pl.col("status") != RunStatus.FAILED)["solution"].to_list())
-    solutions = {name: _solution(name, epochs, hazards, alarms, runs) for name in names}
-    channels = {name: _reactive(one, config) for name, one in solutions.items()}
+    solutions = {name: _tables_of_solution(name, epochs, hazards, alarms, runs) for name in names}
+    channels = {name: _diagnose_reactive(one, config) for name, one in solutions.items()}
     rows: list[Row] = []
     for name, channel in channels.items():
         one = solutions[name]
-        counts = _counts(one.faults, channel, _verdicts_in_table(channel.fails, one.alarms))
+        counts = _architecture_counts(one.faults, channel, _verdicts_in_table(channel.fails, one.alarms))
         rows.append({"architecture": REACTIVE, "solution": name, **counts})
     for name, other in combinations(names, 2):
         pair = {"solution": name, "other": other}
-        rows.append({"architecture": COMPOSITE, **pair, **_composite(solutions[name], solutions[other], config)})
-        rows.append({"architecture": REDUNDANT, **pair, **_redundant(channels[name], channels[other])})
+        rows.append({"architecture": COMPOSITE, **pair, **_count_composite(solutions[name], solutions[other], config)})
+        rows.append({"architecture": REDUNDANT, **pair, **_count_redundant(channels[name], channels[other])})
     moving_s = _moving_s(epochs.filter(pl.col("solution").is_in(names)))
     return pl.DataFrame(rows, schema=COUNTS).with_columns(moving_s=pl.lit(moving_s, pl.Float64))
 
@@ -101,7 +101,7 @@ def _moving_s(epochs: pl.DataFrame) -> float | None:
     return float(steps.filter("may")["step_s"].sum()) if steps["known"].any() else None
 
 
-def _solution(
+def _tables_of_solution(
     name: str, epochs: pl.DataFrame, hazards: pl.DataFrame, alarms: pl.DataFrame, runs: pl.DataFrame
 ) -> SolutionTables:
     """The tables of one solution."""
@@ -115,34 +115,34 @@ def _solution(
     )
 
 
-def _reactive(solution: SolutionTables, config: Configuration) -> _Diagnosed:
+def _diagnose_reactive(solution: SolutionTables, config: Configuration) -> _Diagnosed:
     """One solution under all monitors but the comparison (1oo1); diagnosed where a monitor along has a verdict."""
-    judged = pl.any_horizontal(_evaluated(name) for name in _ALONG)
-    epochs = solution.epochs.drop("moving", "path_m").hstack(_states(solution, trusted(config)).drop("t"))
-    return _channel(epochs, _DIAGNOSIS, judged, config)
+    judged = pl.any_horizontal(_has_verdict(name) for name in _ALONG)
+    epochs = solution.epochs.drop("moving", "path_m").hstack(_state_columns(solution, trusted(config)).drop("t"))
+    return _diagnose(epochs, _DIAGNOSIS, judged, config)
 
 
-def _evaluated(monitor: str) -> pl.Expr:
-    """The monitor has a verdict at this epoch."""
+def _has_verdict(monitor: str) -> pl.Expr:
+    """Expression on epochs: the monitor has a verdict."""
     return pl.col(f"{monitor}_state").cast(pl.String) != MonitorState.NOT_EVALUATED.value
 
 
-def _composite(first: SolutionTables, second: SolutionTables, config: Configuration) -> Row:
-    """Compared at the epochs of the solution that measures less often."""
+def _count_composite(first: SolutionTables, second: SolutionTables, config: Configuration) -> Row:
+    """Counts of two solutions that are compared, at the epochs of the one that measures less often."""
     slower, faster = (first, second) if _period_s(first) >= _period_s(second) else (second, first)
     placed = on_path_of(slower.epochs, faster.epochs, config.lds).with_columns(fix_valid=pl.col("path_m").is_not_null())
     positioned = slower.epochs.with_columns(fix_valid=pl.col("path_m").is_not_null())
     compared = pl.DataFrame(channel_monitor(positioned, placed, config).columns(COMPARISON))
     row_other = paired(slower.epochs, faster.epochs, config.lds)["row_other"]
-    theirs = _states(faster, trusted(config)).select(_STATES.gather(row_other).fill_null(value=False))
-    ours = _states(slower, trusted(config))
+    theirs = _state_columns(faster, trusted(config)).select(_STATES.gather(row_other).fill_null(value=False))
+    ours = _state_columns(slower, trusted(config))
     wrong = ours["wrong"] | theirs["wrong"]
     both = ours.with_columns(
         trusted=ours["trusted"] & theirs["trusted"], known=(ours["known"] & theirs["known"]) | wrong, wrong=wrong
     )
-    channel = _channel(both.hstack(compared), (COMPARISON,), _evaluated(COMPARISON), config)
+    channel = _diagnose(both.hstack(compared), (COMPARISON,), _has_verdict(COMPARISON), config)
     verdicts = [verdict_of_both(alarm, (slower, faster), config.hazards) for alarm in channel.fails.alarms]
-    return _counts(faults_of_pair(slower.faults, faster.faults), channel, verdicts)
+    return _architecture_counts(faults_of_pair(slower.faults, faster.faults), channel, verdicts)
 
 
 def _period_s(solution: SolutionTables) -> float:
@@ -150,8 +150,8 @@ def _period_s(solution: SolutionTables) -> float:
     return nominal_period_s(position_ns(solution.epochs)) or 0.0
 
 
-def _states(solution: SolutionTables, position: pl.Expr) -> pl.DataFrame:
-    """`position` may be relied on, a truth judged it, and judged it wrong."""
+def _state_columns(solution: SolutionTables, position: pl.Expr) -> pl.DataFrame:
+    """Columns: `position` (an expression) may be relied on, a truth judged it, and judged it wrong."""
     known = judged_epoch() & pl.lit(solution.with_truth)
     return solution.epochs.select(
         "t",
@@ -163,8 +163,11 @@ def _states(solution: SolutionTables, position: pl.Expr) -> pl.DataFrame:
     )
 
 
-def _channel(epochs: pl.DataFrame, monitors: tuple[str, ...], judged: pl.Expr, config: Configuration) -> _Diagnosed:
-    """`epochs`: `_states`, with the columns of `monitors` and those that `judged` takes."""
+def _diagnose(epochs: pl.DataFrame, monitors: tuple[str, ...], judged: pl.Expr, config: Configuration) -> _Diagnosed:
+    """What one kind of diagnosis, by these monitors, makes of epochs.
+
+    `epochs`: `_state_columns`, with the columns of `monitors` and those that `judged` takes.
+    """
     clock = Clock.of(epochs, config)
     verdicts = {name: Verdicts.of_table(epochs, name) for name in monitors}
     fails = failure_log(clock.t_ns, np.zeros(clock.t_ns.size, dtype=np.bool_), verdicts, config.lds.recovery_s)
@@ -177,7 +180,7 @@ def _channel(epochs: pl.DataFrame, monitors: tuple[str, ...], judged: pl.Expr, c
     return _Diagnosed(clock, fails, working, known, known & wrong, moving)
 
 
-def _counts(faults: pl.DataFrame, channel: _Diagnosed, verdicts: list[Verdict]) -> Row:
+def _architecture_counts(faults: pl.DataFrame, channel: _Diagnosed, verdicts: list[Verdict]) -> Row:
     """What one kind of diagnosis made of the faults, its alarms, and of the time (`COUNTS`)."""
     clock = channel.clock
     up = uptime(clock.t_ns, channel.working, clock.limit_s)
@@ -196,7 +199,7 @@ def _counts(faults: pl.DataFrame, channel: _Diagnosed, verdicts: list[Verdict]) 
     }
 
 
-def _redundant(first: _Diagnosed, second: _Diagnosed) -> Row:
+def _count_redundant(first: _Diagnosed, second: _Diagnosed) -> Row:
     """Time in which at least one of two reactive channels works; an epoch counts at its own time (LOC eq. 11)."""
     parts = [
         pl.DataFrame({"t_ns": channel.clock.t_ns, "working": channel.working, "moving": channel.moving})

@@ -41,7 +41,7 @@ not, for `up_s`; time judged by a truth, and of this in work and judged wrong, w
 """
 
 
-def added(parts: Iterable[pl.DataFrame]) -> pl.DataFrame:
+def add_counts(parts: Iterable[pl.DataFrame]) -> pl.DataFrame:
     """Counts over several runs; `runs`: how many hold the solutions concerned."""
     sums = [pl.when(pl.col(name).count() > 0).then(pl.col(name).sum()) for name in (*_WHOLE, *_TIMES)]
     groups = pl.concat([pl.DataFrame(schema=COUNTS), *parts]).group_by(_KEYS, maintain_order=True)

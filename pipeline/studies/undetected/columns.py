@@ -5,7 +5,6 @@ from __future__ import annotations
 import dataframely as dy
 import numpy as np
 import polars as pl
-from schemas.monitors import SCALES
 
 from pipeline.stages.epochs.clock import crossing_gaps_ns
 from pipeline.stages.judge.judged import JudgedEpochs
@@ -13,14 +12,22 @@ from pipeline.stages.monitored import MonitoredSolution
 from pipeline.studies.undetected.error import largest_errors
 from pipeline.studies.undetected.figures import Spacing, undetected_figures
 from pipeline.studies.undetected.in_use import Returns, in_use_errors
-from pipeline.studies.undetected.position_tests import bounded, range_bounds, with_channel
+from pipeline.studies.undetected.position_tests import range_bounds, with_bounds, with_channel
 from pipeline.studies.undetected.spacing import largest_spacing
-from pipeline.studies.undetected.watched import NO_ROW, FaultWindow, Watched, fixes_ns, watched, windows
+from pipeline.studies.undetected.watched import (
+    NO_ROW,
+    FaultWindow,
+    Watched,
+    fixes_ns,
+    watch_rows,
+    windows_between_fixes,
+)
 from schemas.arrays import Bools, Floats, Ints, flags, floats, ints
 from schemas.config import Configuration, UndetectedConfig
 from schemas.conform import dtypes
 from schemas.enums import BaliseKind
 from schemas.frozen import frozen
+from schemas.monitors import SCALES
 from schemas.tables import Epochs, Passages
 
 _OF_EPOCHS = ("undetected_{}_m", "undetected_{}_in_use_m")
@@ -43,7 +50,7 @@ class Undetected:
         return undetected_figures(epochs, self.epochs, self.spacing, config.hazards.limits.failure_m)
 
 
-def unnoticed_of(monitored: MonitoredSolution) -> Undetected:
+def largest_unnoticed(monitored: MonitoredSolution) -> Undetected:
     """The largest error that no monitor would have noticed at each epoch and passage.
 
     Never smaller than what any fault of the definition reaches.
@@ -58,14 +65,14 @@ def unnoticed_of(monitored: MonitoredSolution) -> Undetected:
         DOMAIN section 5.6; docs/undetected.md.
     """
     config = monitored.prepared.config
-    nothing = _nothing(Passages, monitored.lds.passages.height)
+    nothing = _null_columns(Passages, monitored.lds.passages.height)
     if not config.undetected.compute:
-        return Undetected(_nothing(Epochs, monitored.solution.epochs.height), nothing)
+        return Undetected(_null_columns(Epochs, monitored.solution.epochs.height), nothing)
     epochs = monitored.solution.epochs.table
-    rows = rows_of(monitored)
-    parts = windows_of(monitored, rows)
-    errors = _both(rows, parts, config.undetected)
-    spacing, before_m = largest_spacing(rows, _driven_m(rows, epochs), config)
+    rows = watched_rows(monitored)
+    parts = fault_windows(monitored, rows)
+    errors = _errors_both_directions(rows, parts, config.undetected)
+    spacing, before_m = largest_spacing(rows, _driven_to_rows_m(rows, epochs), config)
     direction = ints(epochs["direction"], unknown=1)[rows.epoch]
     sizes_m = (errors.error_m, _in_use_m(monitored, rows, parts, errors), _range_m(monitored, rows, parts))
     columns = {
@@ -75,46 +82,46 @@ def unnoticed_of(monitored: MonitoredSolution) -> Undetected:
     }
     at_rows = pl.DataFrame(columns | {"physical_before_m": before_m}).fill_nan(None)
     at_epochs = np.full(epochs.height, NO_ROW)
-    at_epochs[rows.epoch] = np.arange(rows.rows)
+    at_epochs[rows.epoch] = np.arange(rows.count)
     at = rows_of_passages(monitored, rows)
-    of_passages = _gathered(at_rows, at).with_columns(_holding(monitored, errors, at))
+    of_passages = _gather_columns(at_rows, at).with_columns(_bounding_columns(monitored, errors, at))
     return Undetected(
-        _gathered(at_rows, at_epochs).select(name.format(side) for name in _OF_EPOCHS for side in _SIDES),
+        _gather_columns(at_rows, at_epochs).select(name.format(side) for name in _OF_EPOCHS for side in _SIDES),
         of_passages.select(nothing.columns),
         spacing,
     )
 
 
-def _nothing(table: type[dy.Schema], rows: int) -> pl.DataFrame:
+def _null_columns(table: type[dy.Schema], rows: int) -> pl.DataFrame:
     """The columns of a table that are computed here, null in every row."""
     kinds = {name: kind for name, kind in dtypes(table).items() if name.startswith(("undetected_", "physical_"))}
     return pl.DataFrame([pl.Series(name, [None], dtype=kind).new_from_index(0, rows) for name, kind in kinds.items()])
 
 
-def _gathered(at_rows: pl.DataFrame, at: Ints) -> pl.DataFrame:
+def _gather_columns(at_rows: pl.DataFrame, at: Ints) -> pl.DataFrame:
     """The columns of rows at these places, null at `NO_ROW`."""
     place = pl.DataFrame({"at": at}).select(pl.when(pl.col("at") != NO_ROW).then("at")).to_series()
     return at_rows.select(pl.all().gather(place))
 
 
-def rows_of(monitored: MonitoredSolution) -> Watched:
+def watched_rows(monitored: MonitoredSolution) -> Watched:
     """What the monitors watched, the comparison with another solution where the fault is in one alone."""
     prepared = monitored.prepared
     config = prepared.config
     epochs = monitored.solution.epochs.table
-    rows = watched(epochs, monitored.bank.along(), monitored.lds.held, prepared.vehicle, config)
+    rows = watch_rows(epochs, monitored.bank.along(), monitored.lds.held, prepared.vehicle, config)
     if config.undetected.solutions_at_fault == "all":
         return rows
     return with_channel(rows, epochs, monitored.singles["channel"], monitored.other, config.lds)
 
 
-def windows_of(monitored: MonitoredSolution, rows: Watched) -> list[FaultWindow]:
+def fault_windows(monitored: MonitoredSolution, rows: Watched) -> list[FaultWindow]:
     """Windows from each independent fix to the next."""
     prepared = monitored.prepared
     fixes = fixes_ns(
         prepared.run, monitored.lds.crossings, prepared.config.lds.starts_of_mission, prepared.config.undetected
     )
-    return windows(rows, monitored.solution.epochs.t_ns, fixes)
+    return windows_between_fixes(rows, monitored.solution.epochs.t_ns, fixes)
 
 
 @frozen
@@ -130,15 +137,15 @@ class _BothDirections:
     outright: Bools
 
 
-def _both(rows: Watched, parts: list[FaultWindow], config: UndetectedConfig) -> _BothDirections:
+def _errors_both_directions(rows: Watched, parts: list[FaultWindow], config: UndetectedConfig) -> _BothDirections:
     """The largest errors in both directions, window by window."""
-    error = np.full((2, rows.rows), np.nan)
-    since_ns = np.full(rows.rows, -1)
-    paid = np.zeros((rows.rows, 1 + rows.weight.shape[1]))
-    outright = np.zeros(rows.rows, dtype=np.bool_)
+    error = np.full((2, rows.count), np.nan)
+    since_ns = np.full(rows.count, -1)
+    paid = np.zeros((rows.count, 1 + rows.weight.shape[1]))
+    outright = np.zeros(rows.count, dtype=np.bool_)
     for window in parts:
-        grown = rows.since(window.start, window.end, window.since_s)
-        ahead, behind = (largest_errors(travel, config) for travel in (grown, grown.mirrored()))
+        grown = rows.after_fix(window.start, window.end, window.since_s)
+        ahead, behind = (largest_errors(travel, config) for travel in (grown, grown.in_other_direction()))
         part = slice(window.start + 1, window.end + 1)
         worse = ahead.most_m >= behind.most_m
         error[:, part] = (ahead.most_m, behind.most_m)
@@ -156,7 +163,7 @@ def _in_use_m(monitored: MonitoredSolution, rows: Watched, parts: list[FaultWind
     returns = None
     # No negated position returns between fixes without a re-link, or a vehicle file to compare with.
     if config.lds.relink and vehicle.odometer_scale is not None and vehicle.odometer_scale_sigma is not None:
-        returns = Returns.of(rows, epochs, vehicle.odometer_scale_sigma)
+        returns = Returns.of_epochs(rows, epochs, vehicle.odometer_scale_sigma)
     return in_use_errors(rows, parts, errors.error_m, flags(epochs, "tvb")[rows.epoch], returns, config)
 
 
@@ -164,14 +171,14 @@ def _range_m(monitored: MonitoredSolution, rows: Watched, parts: list[FaultWindo
     """Error by the worst range at fault [m]; NaN without ranges."""
     satellites = monitored.prepared.ranges(monitored.solution.name)
     if satellites is None:
-        return np.full((2, rows.rows), np.nan)
+        return np.full((2, rows.count), np.nan)
     low_m, high_m = range_bounds(monitored.aligned, satellites, monitored.prepared.config)
-    return _both(
-        bounded(rows, low_m[rows.epoch], high_m[rows.epoch]), parts, monitored.prepared.config.undetected
+    return _errors_both_directions(
+        with_bounds(rows, low_m[rows.epoch], high_m[rows.epoch]), parts, monitored.prepared.config.undetected
     ).error_m
 
 
-def _driven_m(rows: Watched, epochs: pl.DataFrame) -> Floats:
+def _driven_to_rows_m(rows: Watched, epochs: pl.DataFrame) -> Floats:
     """Distance driven up to each row by the odometer, turns included."""
     odometer_m = floats(epochs, "odometer_m")[rows.epoch]
     driven_m: Floats = np.cumsum(np.abs(np.diff(odometer_m, prepend=odometer_m[:1])))
@@ -185,11 +192,11 @@ def rows_of_passages(monitored: MonitoredSolution, rows: Watched) -> Ints:
     than a crossing may be seen over: that is how wrong the position can have become since the read before.
     """
     passages = monitored.lds.passages
-    if not rows.rows:
+    if not rows.count:
         return np.full(passages.height, NO_ROW)
     t_ns = monitored.solution.epochs.t_ns
     wanted = np.append(monitored.lds.crossings.epoch, -1)[ints(passages["crossing_id"])]
-    row = np.searchsorted(rows.epoch, wanted).clip(max=rows.rows - 1)
+    row = np.searchsorted(rows.epoch, wanted).clip(max=rows.count - 1)
     offered = np.where((wanted >= 0) & (rows.epoch[row] == wanted), row, NO_ROW)
     read_ns = ints(passages["t_offered"].dt.timestamp("ns"))
     stamps = t_ns[rows.epoch]
@@ -200,28 +207,28 @@ def rows_of_passages(monitored: MonitoredSolution, rows: Watched) -> Ints:
     return np.where(physical, np.where(near, before, NO_ROW), offered)
 
 
-def _holding(monitored: MonitoredSolution, errors: _BothDirections, at: Ints) -> list[pl.Series]:
+def _bounding_columns(monitored: MonitoredSolution, errors: _BothDirections, at: Ints) -> list[pl.Series]:
     """`undetected_since, undetected_monitors` of passages at these rows; null where no error is known."""
     known = (at != NO_ROW) & (np.append(errors.since_ns, -1)[at] >= 0)
     rows = [int(row) if yes else None for row, yes in zip(at, known, strict=True)]
-    names = _names(monitored)
+    names = _bounding_names(monitored)
     share = monitored.prepared.config.undetected.holding_share
     since = [None if row is None else int(errors.since_ns[row]) for row in rows]
-    monitors = [None if row is None else _monitors(errors, row, names, share) for row in rows]
+    monitors = [None if row is None else _monitors_at_row(errors, row, names, share) for row in rows]
     return [
         pl.Series("undetected_since", since, dtype=pl.Int64).cast(pl.Datetime("ns", "UTC")),
         pl.Series("undetected_monitors", monitors, dtype=pl.List(pl.String)),
     ]
 
 
-def _names(monitored: MonitoredSolution) -> list[str]:
+def _bounding_names(monitored: MonitoredSolution) -> list[str]:
     """The monitors along the track in use (raw stands for the largest rate of a fault too), and who holds outright."""
     enabled = monitored.bank.along().enabled
     along = [f"along_{name}" for index, name in enumerate(SCALES) if enabled[index] or index == 0]
     return [*along, "channel" if monitored.prepared.config.undetected.solutions_at_fault == "one" else "link_distance"]
 
 
-def _monitors(errors: _BothDirections, row: int, names: list[str], least: float) -> list[str]:
+def _monitors_at_row(errors: _BothDirections, row: int, names: list[str], least: float) -> list[str]:
     """Monitors that hold the larger error at a row, first what holds most of it; none where the bank was blind."""
     if errors.outright[row]:
         return [names[-1]]

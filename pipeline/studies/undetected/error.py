@@ -10,14 +10,14 @@ from collections.abc import Callable
 
 import numpy as np
 
-from pipeline.studies.undetected.splits import Growth, best_shares, growth_of, horizons
+from pipeline.studies.undetected.splits import BoundedGrowth, best_shares, bound_growth, split_horizons
 from pipeline.studies.undetected.stretch import GrowthStretch, stretch_after
 from pipeline.studies.undetected.watched import NO_ROW, Watched
 from schemas.arrays import Bools, Floats, Ints
 from schemas.config import UndetectedConfig
 from schemas.frozen import frozen
 
-Grow = Callable[[GrowthStretch], Growth]
+Grow = Callable[[GrowthStretch], BoundedGrowth]
 # How many rows to look back over, and the split of these rows.
 After = list[tuple[int, Floats]]
 
@@ -32,20 +32,21 @@ class Errors:
 
 
 def largest_errors(
-    window: Watched, config: UndetectedConfig, grow: Grow = growth_of, after: After | None = None
+    window: Watched, config: UndetectedConfig, grow: Grow = bound_growth, after: After | None = None
 ) -> Errors:
     """The largest error ahead at all rows but the first, of a fault that began after the first (`Watched.since`).
 
-    `after`: splits to look back at tests of the position with, by default the best ones here; any of them is a bound.
+    `grow`: bound of the growth over a stretch; `after`: splits to look back at tests of the position with, by default
+    the best ones here; any of them is a bound.
     """
-    most = np.zeros(window.rows)
-    paid = np.zeros((window.rows, 1 + window.weight.shape[1]))
-    outright = np.zeros(window.rows, dtype=np.bool_)
-    after_level = _after_levels(window, splits_after(window, config) if after is None else after)
+    most = np.zeros(window.count)
+    paid = np.zeros((window.count, 1 + window.weight.shape[1]))
+    outright = np.zeros(window.count, dtype=np.bool_)
+    after_level = _after_tests_m(window, splits_after_tests(window, config) if after is None else after)
     begins = [0, *(1 + np.flatnonzero(window.fresh[1:] | window.free[1:])).tolist()]
-    for begin, beyond in zip(begins, [*begins[1:], window.rows], strict=True):
+    for begin, beyond in zip(begins, [*begins[1:], window.count], strict=True):
         if begin:
-            most[begin] = min(_across(window, begin, most), after_level[begin])
+            most[begin] = min(_error_across_m(window, begin, most), after_level[begin])
             outright[begin] = after_level[begin] == most[begin]
         if begin + 1 < beyond:
             growth = grow(stretch_after(window, begin, beyond - 1, known=begin == 0))
@@ -58,58 +59,61 @@ def largest_errors(
     return Errors(most[1:], paid[1:], outright[1:])
 
 
-def _across(window: Watched, row: int, most_m: Floats) -> float:
-    """The fault at a row to which the bank saw no increment, or at a re-link inside one."""
+def _error_across_m(window: Watched, row: int, most_m: Floats) -> float:
+    """The error [m] that a fault may have at a row to which the bank saw no increment, or at a re-link inside one."""
     if window.fresh[row]:
         unobserved_m = float(window.fastest_m[row])
     else:
         stretch = stretch_after(window, row - 1, row, known=row == 1)
-        unobserved_m = float(growth_of(stretch).most_m[0]) + _learned_m(window, row)
+        unobserved_m = float(bound_growth(stretch).most_m[0]) + _hidden_by_learning_m(window, row)
     anchor = window.anchor[row]
     at_anchor = float(most_m[anchor]) if anchor != NO_ROW else 0.0
     return min(float(most_m[row - 1]) + unobserved_m, at_anchor + float(window.held_high_m[row]))
 
 
-def _learned_m(window: Watched, row: int) -> float:
+def _hidden_by_learning_m(window: Watched, row: int) -> float:
     """What learned scale and latency may hide over the step to a row [m]."""
     late_m = window.learned_late_m[row] + (window.learned_late_m[row - 1] if row > 1 else 0.0)
     return float(window.learned_m[row] + late_m)
 
 
-def _after_levels(window: Watched, splits: After) -> Floats:
+def _after_tests_m(window: Watched, splits: After) -> Floats:
     """What tests of the position itself leave at each row [m]: their own bound, or one before and the growth since."""
     best = window.high_m.copy()
     best[0] = np.inf
     for lag, shares in splits:
         begins = np.flatnonzero(np.isfinite(window.high_m[:-lag]))
-        begins = begins[(begins > 0) & _unbroken(window, begins, lag)]
+        begins = begins[(begins > 0) & _are_unbroken(window, begins, lag)]
         if begins.size:
-            grown = _growth_at(window, begins, lag, shares)
+            grown = _growth_over_m(window, begins, lag, shares)
             np.minimum.at(best, begins + lag, window.high_m[begins] + grown)
     return best
 
 
-def _unbroken(window: Watched, begins: Ints, lag: int) -> Bools:
+def _are_unbroken(window: Watched, begins: Ints, lag: int) -> Bools:
     """Whether the bank did not begin anew within `lag` rows after each of these."""
     broken = np.cumsum(window.fresh)
     unbroken: Bools = broken[begins + lag] == broken[begins]
     return unbroken
 
 
-def splits_after(window: Watched, config: UndetectedConfig) -> After:
+def splits_after_tests(window: Watched, config: UndetectedConfig) -> After:
     """Splits for stretches whose averages at the start are not known, as a longest stretch in the middle has them."""
     if not np.isfinite(window.high_m[1:]).any():
         return []
-    first, last = window.longest
+    first, last = window.longest_stretch
     period_s = max(float(np.median(np.diff(window.t_s[first : last + 1]))) if last > first else 1.0, 1e-3)
     most = min(last - first - 1, int(config.look_back_s / period_s))
     middle = (first + last - most) // 2
-    lags = [1, *horizons(most)] if most > 0 else []
+    lags = [1, *split_horizons(most)] if most > 0 else []
     return [(lag, best_shares(stretch_after(window, middle, middle + lag, known=False))) for lag in lags]
 
 
-def _growth_at(window: Watched, begins: Ints, lag: int, shares: Floats) -> Floats:
-    """Growth from each of these rows over `lag` rows, its averages at the start not known, with one split for all."""
+def _growth_over_m(window: Watched, begins: Ints, lag: int, shares: Floats) -> Floats:
+    """Growth of a fault [m] from each of the rows `begins` over `lag` rows, with one split `shares` for all.
+
+    Shape (begins,). The averages at the start are not known, so they count with their thresholds.
+    """
     total = np.zeros(begins.size)
     threshold = np.where(window.fresh[begins, None], 0.0, window.threshold_mps[begins])
     carried = np.zeros_like(threshold)  # part of the row after, as it falls to the averages here

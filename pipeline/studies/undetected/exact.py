@@ -45,7 +45,7 @@ def largest_profile(window: Watched, margin: float = 0.0) -> Optimum:
     """
     from scipy.optimize import linprog  # only who asks for a profile solves the whole
 
-    program = _program(window, margin)
+    program = _linear_program(window, margin)
     goal = np.zeros(program.low.size)
     goal[program.fault[-1]] = -1.0
     solution = linprog(
@@ -61,7 +61,7 @@ def largest_profile(window: Watched, margin: float = 0.0) -> Optimum:
     if solution.status != 0:
         raise BaliseError("the linear program of the largest error has no solution", found=str(solution.message))
     fault = np.concatenate([[0.0], solution.x[program.fault]])
-    return Optimum(float(fault[-1]), fault, _binding(window, program, solution.x))
+    return Optimum(float(fault[-1]), fault, _binding_bounds(window, program, solution.x))
 
 
 class _Program(NamedTuple):
@@ -79,11 +79,15 @@ class _Program(NamedTuple):
     fault: Ints
 
 
-def _program(window: Watched, margin: float) -> _Program:
-    """A_i - (1-w) A_(i-1) - w y_i = 0 for each average, and f_i - f_(i-1) - gain (y_i - u_i) - unobserved_i = 0."""
+def _linear_program(window: Watched, margin: float) -> _Program:
+    """The linear program of one window.
+
+    Equations: A_i - (1-w) A_(i-1) - w y_i = 0 for each average, and f_i - f_(i-1) - gain (y_i - u_i) - unobserved_i =
+    0.
+    """
     from scipy import sparse
 
-    count = window.rows - 1
+    count = window.count - 1
     averages = window.weight.shape[1]
     observed = ~window.fresh[1:]
     unit = sparse.identity(count)
@@ -109,7 +113,7 @@ def _program(window: Watched, margin: float) -> _Program:
     blocks.append([sparse.diags(gain_s * scale), *[None] * averages, grown, -unit])
     right.append(gain_s * window.rate_mps[1:])
     order = np.arange((averages + 3) * count).reshape(-1, count).T.ravel()
-    relinks, relink_bounds = _relinks(window, averages + 1)
+    relinks, relink_bounds = _relink_rows(window, averages + 1)
     inside = 1.0 - margin
     most = (window.learned_m + np.where(window.fresh, window.fastest_m, 0.0))[1:]
     ones = [np.ones(count)] * averages
@@ -138,7 +142,7 @@ def _program(window: Watched, margin: float) -> _Program:
     )
 
 
-def _relinks(window: Watched, before: int) -> tuple[sparse.csc_matrix | None, Floats | None]:
+def _relink_rows(window: Watched, before: int) -> tuple[sparse.csc_matrix | None, Floats | None]:
     """Fault at a re-link minus fault at its anchor within the recorded bounds; before the window it is zero.
 
     `before`: how many unknowns of each row stand before the fault; one stands after it.
@@ -150,9 +154,9 @@ def _relinks(window: Watched, before: int) -> tuple[sparse.csc_matrix | None, Fl
     if not rows.size:
         return None, None
     # The first row, at which there is no fault yet, has no unknown.
-    faults = sparse.identity(window.rows, format="csr")[:, 1:]
+    faults = sparse.identity(window.count, format="csr")[:, 1:]
     difference = faults[rows] - faults[np.maximum(window.anchor[rows], 0)]
-    empty = [sparse.csr_matrix((rows.size, parts * (window.rows - 1))) for parts in (before, 1)]
+    empty = [sparse.csr_matrix((rows.size, parts * (window.count - 1))) for parts in (before, 1)]
     difference = sparse.hstack([empty[0], difference, empty[1]])
     return (
         sparse.vstack([difference, -difference], format="csc"),
@@ -160,13 +164,13 @@ def _relinks(window: Watched, before: int) -> tuple[sparse.csc_matrix | None, Fl
     )
 
 
-def _binding(window: Watched, program: _Program, solution: Floats) -> tuple[int, ...]:
+def _binding_bounds(window: Watched, program: _Program, solution: Floats) -> tuple[int, ...]:
     """Which bounds the profile reaches, by how many rows do."""
     low = program.low
     high = program.high
     averages = window.weight.shape[1]
     margin = MARGIN * np.maximum(1.0, np.abs(np.where(np.isfinite(low) & np.isfinite(high), high, 1.0)))
-    reached = ((solution >= high - margin) | (solution <= low + margin)).reshape(window.rows - 1, -1)
+    reached = ((solution >= high - margin) | (solution <= low + margin)).reshape(window.count - 1, -1)
     counts = {which: int((reached[:, which] & ~window.fresh[1:]).sum()) for which in range(averages + 1)}
     counts[-1] = int(reached[:, averages + 1].sum())
     return tuple(sorted((which for which, rows in counts.items() if rows), key=lambda which: -counts[which]))

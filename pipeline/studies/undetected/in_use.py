@@ -43,7 +43,7 @@ class Returns:
     scale_sigma: float
 
     @classmethod
-    def of(cls, rows: Watched, epochs: pl.DataFrame, scale_sigma: float) -> Returns:
+    def of_epochs(cls, rows: Watched, epochs: pl.DataFrame, scale_sigma: float) -> Returns:
         """The rows of the aligned epochs of the solution; `scale_sigma`: of the vehicle file [1]."""
         path_m, odometer_m, sigma_m, travelled_m, doubt_m = (
             floats(epochs, name)[rows.epoch]
@@ -51,7 +51,7 @@ class Returns:
         )
         return cls(path_m - odometer_m, sigma_m, travelled_m, doubt_m, scale_sigma)
 
-    def within(self, part: slice) -> Returns:
+    def some_rows(self, part: slice) -> Returns:
         """The same at some of the rows."""
         return Returns(
             self.offset_m[part],
@@ -79,20 +79,20 @@ def in_use_errors(
     for window in windows:
         part = slice(window.start, window.end + 1)
         grown = slice(window.start + 1, window.end + 1)
-        if not validated[_of_mission(rows, window, config) & (np.arange(rows.rows) < window.start)].any():
+        if not validated[_before_mission_fix(rows, window, config) & (np.arange(rows.count) < window.start)].any():
             continue
         if returns is None:
             errors[:, grown] = unnoticed_m[:, grown]
             continue
-        within = rows.between(part.start, part.stop)
-        for side, sign, travel in ((0, 1.0, within), (1, -1.0, within.mirrored())):
+        within = rows.rows_between(part.start, part.stop)
+        for side, sign, travel in ((0, 1.0, within), (1, -1.0, within.in_other_direction())):
             largest_m = np.concatenate([[0.0], unnoticed_m[side, grown]])
-            found = _Window(travel, returns.within(part), validated[part], sign, config)
-            errors[side, grown] = found.largest_m(largest_m)[1:]
+            found = _InUseWindow(travel, returns.some_rows(part), validated[part], sign, config)
+            errors[side, grown] = found.largest_errors_m(largest_m)[1:]
     return errors
 
 
-def _of_mission(rows: Watched, window: FaultWindow, config: Configuration) -> Bools:
+def _before_mission_fix(rows: Watched, window: FaultWindow, config: Configuration) -> Bools:
     """The rows since the last start of mission up to the fix of a window: what was validated before is forgotten."""
     missions_ns = [round(start.timestamp() * NS_PER_S) for start in config.lds.starts_of_mission]
     since_s = [window.since_s - (window.since_ns - t_ns) / NS_PER_S for t_ns in missions_ns if t_ns <= window.since_ns]
@@ -100,7 +100,7 @@ def _of_mission(rows: Watched, window: FaultWindow, config: Configuration) -> Bo
 
 
 @frozen
-class _Window:
+class _InUseWindow:
     """One window, which begins with a fix, in one direction."""
 
     watched: Watched
@@ -109,25 +109,27 @@ class _Window:
     sign: float
     config: Configuration
 
-    def largest_m(self, unnoticed_m: Floats) -> Floats:
+    def largest_errors_m(self, unnoticed_m: Floats) -> Floats:
         """The largest error at each row; NaN once the distance was lost."""
-        held_m = self._held_m(unnoticed_m, 0.0)
+        held_m = self._held_errors_m(unnoticed_m, 0.0)
         hold_s = _LAST_TENTH / min(self.config.monitors.ewma_alphas)
         if "link_distance" in self.config.monitors.disabled:
             hold_s = 0.0
-        ended_m = self._held_m(unnoticed_m, hold_s)
-        most_m = np.maximum(unnoticed_m, np.maximum(held_m, self._after_m(ended_m)))
+        ended_m = self._held_errors_m(unnoticed_m, hold_s)
+        most_m = np.maximum(unnoticed_m, np.maximum(held_m, self._errors_after_hold_m(ended_m)))
         unknown = is_lost(self.returns.doubt_m - self.returns.doubt_m[0])
         return np.where(unknown | np.isinf(most_m), np.nan, most_m)
 
-    def _held_m(self, unnoticed_m: Floats, since_s: float) -> Floats:
+    def _held_errors_m(self, unnoticed_m: Floats, since_s: float) -> Floats:
         """The largest error at each row while it is held to an anchor, for so long since its return."""
         reach_m = unnoticed_m + self.sign * self.returns.offset_m + self.watched.learned_late_m
-        anchors_m = self._anchors_m(reach_m, since_s)
-        held_m: Floats = anchors_m + self._bound_m() - self.sign * self.returns.offset_m + self.watched.learned_late_m
+        anchors_m = self._largest_anchors_m(reach_m, since_s)
+        held_m: Floats = (
+            anchors_m + self._relink_bounds_m() - self.sign * self.returns.offset_m + self.watched.learned_late_m
+        )
         return held_m
 
-    def _anchors_m(self, reach_m: Floats, since_s: float) -> Floats:
+    def _largest_anchors_m(self, reach_m: Floats, since_s: float) -> Floats:
         """The largest U(A) + x(A) of these anchors at each row."""
         t_s = self.watched.t_s
         of_tvb = np.where(self.validated, reach_m, -np.inf)
@@ -140,7 +142,7 @@ class _Window:
         delay_s = self.config.lds.recovery_s + since_s
         return np.maximum(before_m, np.where(t_s - t_s[0] >= delay_s, fix_m, -np.inf))
 
-    def _bound_m(self) -> Floats:
+    def _relink_bounds_m(self) -> Floats:
         """The widest bound of a re-link at each row: with the anchor at the first row, and the largest sigma since."""
         returns = self.returns
         rule = RecoveryRule(self.config)
@@ -152,13 +154,15 @@ class _Window:
         widest_m: Floats = np.minimum(self.config.hazards.limits.relink_m, bound_m + doubt_m)
         return widest_m
 
-    def _after_m(self, ended_m: Floats) -> Floats:
+    def _errors_after_hold_m(self, ended_m: Floats) -> Floats:
         """The error at each row after a hold that ended at some row before with at most `ended_m`."""
         averages = range(self.watched.weight.shape[1])
-        least: Floats = np.min([self._grown_m(ended_m, average) for average in averages], axis=0, initial=np.inf)
+        least: Floats = np.min(
+            [self._growth_by_average_m(ended_m, average) for average in averages], axis=0, initial=np.inf
+        )
         return least
 
-    def _grown_m(self, ended_m: Floats, average: int) -> Floats:
+    def _growth_by_average_m(self, ended_m: Floats, average: int) -> Floats:
         """Growth by one average alone: gain_s y = gain_s / w (A_i - (1 - w) A_(i-1)), and each |A| within its
         threshold.
         """

@@ -36,26 +36,26 @@ def with_channel(
     if second is None:
         return rows
     value, threshold = channel.value[rows.epoch], channel.threshold[rows.epoch]
-    before = _share_before(epochs, second, lds)[rows.epoch]
+    before = _shares_before(epochs, second, lds)[rows.epoch]
     moving = before * rows.gain_s
     ahead_m = moving * np.maximum(rows.most_mps - rows.rate_mps, 0.0)
     behind_m = moving * np.maximum(rows.rate_mps - rows.least_mps, 0.0)
     # The position in between is bounded only where the bank saw the step to the epoch.
     observed = ~rows.fresh & (np.diff(rows.epoch, prepend=-1) == 1)
     known = np.isfinite(value) & np.isfinite(threshold) & (observed | (before == 0.0))
-    return bounded(
+    return with_bounds(
         rows,
         np.where(known, -threshold - value - behind_m, -np.inf),
         np.where(known, threshold - value + ahead_m, np.inf),
     )
 
 
-def bounded(rows: Watched, low_m: Floats, high_m: Floats) -> Watched:
+def with_bounds(rows: Watched, low_m: Floats, high_m: Floats) -> Watched:
     """The rows with the fault held within these bounds too."""
     return replace(rows, low_m=np.maximum(rows.low_m, low_m), high_m=np.minimum(rows.high_m, high_m))
 
 
-def _share_before(epochs: pl.DataFrame, second: pl.DataFrame, lds: LdsConfig) -> Floats:
+def _shares_before(epochs: pl.DataFrame, second: pl.DataFrame, lds: LdsConfig) -> Floats:
     """How far before the epoch, as a share of the step to it, this solution was compared with the other."""
     placed = pl.when(pl.col("fix_valid") & pl.col("on_track") & pl.col("path_m").is_not_null())
     numbered = epochs.with_row_index("row").select("t", path_m=placed.then(pl.col("row").cast(pl.Float64)))
@@ -78,13 +78,13 @@ def range_bounds(epochs: MatchedEpochs, satellites: pl.DataFrame, config: Config
         tested = part.freedom > 0
         threshold = np.full(part.epoch.size, np.inf)
         threshold[tested] = chdtri(part.freedom[tested], config.monitors.false_alarm_probability)
-        low[part.epoch], high[part.epoch] = _worst(part, threshold)
+        low[part.epoch], high[part.epoch] = _worst_satellites_m(part, threshold)
     return low, high
 
 
-def _worst(part: Equations, threshold: Floats) -> tuple[Floats, Floats]:
+def _worst_satellites_m(part: Equations, threshold: Floats) -> tuple[Floats, Floats]:
     """Least and largest fault [m] over the satellites of each epoch; threshold (epochs,), infinite where not tested."""
-    left, linear, square = _parabola(part)
+    left, linear, square = _residual_parabola(part)
     gain = _gain_along(part)
     room = np.maximum(threshold - left, 0.0)[:, None]
     visible = part.held & (square > _INVISIBLE * part.weight)
@@ -100,7 +100,7 @@ def _worst(part: Equations, threshold: Floats) -> tuple[Floats, Floats]:
     return np.where(untested, -np.inf, low), np.where(untested, np.inf, high)
 
 
-def _parabola(part: Equations) -> tuple[Floats, Floats, Floats]:
+def _residual_parabola(part: Equations) -> tuple[Floats, Floats, Floats]:
     """SS, shape (epochs,), and c and d of each satellite, shape (epochs, satellites), as at the top of this file."""
     weighted = part.design * part.weight[..., None]
     normal = normal_of(part.design, part.weight, part.prior)

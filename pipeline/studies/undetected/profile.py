@@ -4,16 +4,16 @@ from __future__ import annotations
 
 import numpy as np
 import polars as pl
-from schemas.monitors import SCALES
 
 from pipeline.stages.monitored import MonitoredSolution
-from pipeline.studies.undetected.columns import rows_of, rows_of_passages, windows_of
+from pipeline.studies.undetected.columns import fault_windows, rows_of_passages, watched_rows
 from pipeline.studies.undetected.error import largest_errors
 from pipeline.studies.undetected.exact import MARGIN, largest_profile
 from pipeline.studies.undetected.steps_and_ramps import largest_of_shape
 from schemas.arrays import NS_PER_S, ints, times_ns
 from schemas.errors import UsageError
 from schemas.frozen import frozen
+from schemas.monitors import SCALES
 
 
 @frozen
@@ -37,18 +37,18 @@ class FaultProfile:
 def profile_at(monitored: MonitoredSolution, epoch: int, behind: bool) -> FaultProfile:
     """The largest unnoticed fault at an epoch, ahead or behind in the direction of travel there."""
     epochs = monitored.solution.epochs.table
-    rows = rows_of(monitored)
+    rows = watched_rows(monitored)
     row = int(np.searchsorted(rows.epoch, epoch))
-    window = next((part for part in windows_of(monitored, rows) if part.start < row <= part.end), None)
-    if window is None or row >= rows.rows or rows.epoch[row] != epoch:
+    window = next((part for part in fault_windows(monitored, rows) if part.start < row <= part.end), None)
+    if window is None or row >= rows.count or rows.epoch[row] != epoch:
         raise UsageError(
             "has no fault to look for",
             place=f"epoch {epoch}",
             expected="an epoch with a position and an odometer, not negated, after the last independent fix",
         )
     against = behind != bool(ints(epochs["direction"], unknown=1)[epoch] < 0)
-    part = rows.since(window.start, row, window.since_s)
-    travel = part.mirrored() if against else part
+    part = rows.after_fix(window.start, row, window.since_s)
+    travel = part.in_other_direction() if against else part
     optimum = largest_profile(travel, MARGIN)
     enabled = monitored.bank.along().enabled
     names = [name for name, on in zip(SCALES, enabled, strict=True) if on or name == "raw"]
@@ -67,7 +67,7 @@ def profile_at(monitored: MonitoredSolution, epoch: int, behind: bool) -> FaultP
 
 def epoch_of(monitored: MonitoredSolution, balise: str | None, at_s: float | None) -> int:
     """The epoch that is asked for: of the first passage of a balise, the last one up to a time, or the last one."""
-    rows = rows_of(monitored)
+    rows = watched_rows(monitored)
     passages = monitored.lds.passages
     if balise is None:
         t_ns = monitored.solution.epochs.t_ns

@@ -13,7 +13,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from pipeline.studies.undetected.stretch import GrowthStretch, paid_m
+from pipeline.studies.undetected.stretch import GrowthStretch, payments_m
 from schemas.arrays import Floats, Ints
 from schemas.frozen import frozen
 
@@ -31,7 +31,7 @@ class _Blocks(NamedTuple):
     of_row: Ints
 
     @classmethod
-    def over(cls, rows: int) -> _Blocks:
+    def of_rows(cls, rows: int) -> _Blocks:
         """Blocks over so many rows, each longer than the one before."""
         edges = [0]
         while edges[-1] < rows:
@@ -40,7 +40,7 @@ class _Blocks(NamedTuple):
         end = np.array(edges[1:])
         return cls(first, end - 1, np.repeat(np.arange(first.size), end - first))
 
-    def lines(self, row: Ints) -> Floats:
+    def weights_at(self, row: Ints) -> Floats:
         """What the shares at both ends of the blocks, two columns each, are at these rows: straight lines between."""
         block = self.of_row[row]
         each = np.arange(row.size)
@@ -56,10 +56,10 @@ def best_shares(stretch: GrowthStretch) -> Floats:
     from scipy.linalg import block_diag  # most replays solve nothing
     from scipy.optimize import linprog
 
-    blocks = _Blocks.over(stretch.rows)
+    blocks = _Blocks.of_rows(stretch.count)
     monitors = 1 + stretch.watched.weight.shape[1]
     ends = 2 * blocks.first.size
-    parts = [_raw(stretch, blocks), *(_average(stretch, blocks, average) for average in range(monitors - 1))]
+    parts = [_raw_cost(stretch, blocks), *(_average_cost(stretch, blocks, average) for average in range(monitors - 1))]
     costs = np.concatenate([part.cost for part in parts])
     linear = np.concatenate([part.linear for part in parts])
     gauge = max(float(costs.max()), 1e-12)
@@ -75,7 +75,7 @@ def best_shares(stretch: GrowthStretch) -> Floats:
         method="highs-ds",
     )
     knots = optimum.x[: monitors * ends].reshape(monitors, ends) if optimum.status == 0 else np.zeros((monitors, ends))
-    shares: Floats = blocks.lines(np.arange(stretch.rows)) @ knots.T
+    shares: Floats = blocks.weights_at(np.arange(stretch.count)) @ knots.T
     # They add up to one, to the last digit.
     shares[:, 0] += 1.0 - shares.sum(axis=1)
     return shares
@@ -89,24 +89,24 @@ class _MonitorCost(NamedTuple):
     linear: Floats
 
 
-def _raw(stretch: GrowthStretch, blocks: _Blocks) -> _MonitorCost:
+def _raw_cost(stretch: GrowthStretch, blocks: _Blocks) -> _MonitorCost:
     """What the monitor of raw differences costs a fault, split between both ends of each block."""
     raw_mps = np.maximum(np.abs(stretch.watched.most_mps), np.abs(stretch.watched.least_mps))
-    raw_m = np.add.reduceat(stretch.watched.gain_s * _tested(raw_mps), blocks.first)
+    raw_m = np.add.reduceat(stretch.watched.gain_s * _priced_thresholds(raw_mps), blocks.first)
     single = blocks.first == blocks.last
     cost = np.column_stack([np.where(single, raw_m, 0.5 * raw_m), np.where(single, 0.0, 0.5 * raw_m)]).ravel()
     return _MonitorCost(np.eye(cost.size), cost, np.zeros(cost.size))
 
 
-def _average(stretch: GrowthStretch, blocks: _Blocks, average: int) -> _MonitorCost:
+def _average_cost(stretch: GrowthStretch, blocks: _Blocks, average: int) -> _MonitorCost:
     """What the monitor of one average costs a fault."""
     weight = stretch.watched.weight[:, average]
     part = stretch.watched.gain_s / weight
     # What a row gives to the average, its row before has to pay for in part; the last row has none after it.
     after = np.append((part * (1.0 - weight))[1:], 0.0)
-    at, cost = _paid_at(blocks, _tested(stretch.watched.threshold_mps[:, average]))
-    following = np.minimum(at + 1, stretch.rows - 1)
-    terms = part[at, None] * blocks.lines(at) - after[at, None] * blocks.lines(following)
+    at, cost = _paying_rows(blocks, _priced_thresholds(stretch.watched.threshold_mps[:, average]))
+    following = np.minimum(at + 1, stretch.count - 1)
+    terms = part[at, None] * blocks.weights_at(at) - after[at, None] * blocks.weights_at(following)
     start = np.eye(1, terms.shape[1]) * part[0] * (1.0 - weight[0])
     linear = np.zeros(terms.shape[1])
     linear -= start[0] * stretch.start_mps[average]
@@ -116,7 +116,7 @@ def _average(stretch: GrowthStretch, blocks: _Blocks, average: int) -> _MonitorC
     return _MonitorCost(terms, cost, linear)
 
 
-def _paid_at(blocks: _Blocks, threshold: Floats) -> tuple[Ints, Floats]:
+def _paying_rows(blocks: _Blocks, threshold: Floats) -> tuple[Ints, Floats]:
     """Rows whose payment stands for those of their block, and how much: its first, its last but one, its last.
 
     Payments inside a block run along a straight line: the mean of both ends stands for them.
@@ -128,7 +128,7 @@ def _paid_at(blocks: _Blocks, threshold: Floats) -> tuple[Ints, Floats]:
     return np.concatenate([first, last - 1, blocks.last]), np.concatenate([half, half, threshold[blocks.last]])
 
 
-def _tested(threshold: Floats) -> Floats:
+def _priced_thresholds(threshold: Floats) -> Floats:
     """Thresholds, with a price out of reach where nothing is tested."""
     tested = np.isfinite(threshold)
     if tested.all():
@@ -138,44 +138,44 @@ def _tested(threshold: Floats) -> Floats:
 
 
 @frozen
-class Growth:
+class BoundedGrowth:
     """`most_m` (rows,): the fault's growth since the start, at most; `paid_m` (rows, 1 + averages): what bounds it."""
 
     most_m: Floats
     paid_m: Floats
 
 
-def growth_of(stretch: GrowthStretch) -> Growth:
+def bound_growth(stretch: GrowthStretch) -> BoundedGrowth:
     """The growth that no monitor would have noticed, from above, at every row of a stretch."""
-    return growth_with(stretch, splits_of(stretch))
+    return bound_growth_with(stretch, best_splits(stretch))
 
 
-def growth_with(stretch: GrowthStretch, splits: Iterable[Floats]) -> Growth:
+def bound_growth_with(stretch: GrowthStretch, splits: Iterable[Floats]) -> BoundedGrowth:
     """The least bound of the growth per row, over these splits, each of shape (some rows, 1 + averages).
 
     A split shares the fault out among the monitors: any bounds the growth, also one for the first rows only.
     """
-    most = np.full(stretch.rows, np.inf)
+    most = np.full(stretch.count, np.inf)
     monitors = 1 + stretch.watched.weight.shape[1]
-    paid = np.zeros((stretch.rows, monitors))
-    to_one_monitor = (np.tile(alone, (stretch.rows, 1)) for alone in np.eye(monitors))
+    paid = np.zeros((stretch.count, monitors))
+    to_one_monitor = (np.tile(alone, (stretch.count, 1)) for alone in np.eye(monitors))
     for shares in (*to_one_monitor, *splits):
-        part = stretch.first(len(shares))
-        by_monitor_m = paid_m(part, shares[: part.rows])
+        part = stretch.first_rows(len(shares))
+        by_monitor_m = payments_m(part, shares[: part.count])
         total_m = by_monitor_m.sum(axis=1)
         better = np.flatnonzero(total_m < most[: total_m.size])
         most[better] = total_m[better]
         paid[better] = by_monitor_m[better]
-    return Growth(most - stretch.recorded_m, paid)
+    return BoundedGrowth(most - stretch.recorded_m, paid)
 
 
-def splits_of(stretch: GrowthStretch) -> Iterator[Floats]:
+def best_splits(stretch: GrowthStretch) -> Iterator[Floats]:
     """The best up to rows that lie farther and farther on."""
-    for rows in horizons(stretch.rows):
-        yield best_shares(stretch.first(rows))
+    for rows in split_horizons(stretch.count):
+        yield best_shares(stretch.first_rows(rows))
 
 
-def horizons(rows: int) -> list[int]:
+def split_horizons(rows: int) -> list[int]:
     """Numbers of rows up to which the best split is sought, the last one all of them; one row needs none.
 
     The best split up to one row is good up to the rows around it too.

@@ -34,13 +34,13 @@ class GrowthStretch:
     start_free_mps: Floats
 
     @property
-    def rows(self) -> int:
+    def count(self) -> int:
         """How many rows."""
-        return self.watched.rows
+        return self.watched.count
 
-    def first(self, rows: int) -> GrowthStretch:
+    def first_rows(self, rows: int) -> GrowthStretch:
         """Its first rows alone."""
-        return replace(self, watched=self.watched.between(0, rows))
+        return replace(self, watched=self.watched.rows_between(0, rows))
 
     @property
     def recorded_m(self) -> Floats:
@@ -53,13 +53,13 @@ def stretch_after(rows: Watched, start: int, end: int, known: bool) -> GrowthStr
     averages = rows.average_mps[start]
     thresholds = rows.threshold_mps[start]
     nothing = np.zeros_like(averages)
-    watched = rows.between(start + 1, end + 1)
+    watched = rows.rows_between(start + 1, end + 1)
     if known or rows.fresh[start]:
         return GrowthStretch(watched, averages, nothing)
     return GrowthStretch(watched, nothing, thresholds)
 
 
-def paid_m(stretch: GrowthStretch, shares: Floats) -> Floats:
+def payments_m(stretch: GrowthStretch, shares: Floats) -> Floats:
     """What raw (first) and each average pay for the sum of gain_s y up to each row; shapes (rows, 1 + averages).
 
     `shares`: of each row, raw first; they add up to one. The sum up to a row ends there: what the last row gives to an
@@ -72,14 +72,14 @@ def paid_m(stretch: GrowthStretch, shares: Floats) -> Floats:
     before = part * (1.0 - watched.weight)
     inside = part.copy()
     inside[:-1] -= before[1:]
-    inner = _cost(inside, watched.threshold_mps)
-    paid = _cost(part, watched.threshold_mps)
+    inner = _cost_m(inside, watched.threshold_mps)
+    paid = _cost_m(part, watched.threshold_mps)
     paid[1:] += np.cumsum(inner[:-1], axis=0)
     paid += np.abs(before[0]) * stretch.start_free_mps - before[0] * stretch.start_mps
     return np.column_stack([np.cumsum(raw), paid])
 
 
-def _cost(part: Floats, threshold: Floats) -> Floats:
+def _cost_m(part: Floats, threshold: Floats) -> Floats:
     """|part| times the threshold; what falls to no one costs nothing, even where nothing is tested."""
     cost: Floats = np.abs(part) * np.where(part == 0.0, 0.0, threshold)
     return cost

@@ -35,7 +35,7 @@ class Watched:
     `epoch`: row among all epochs; `t_s`: seconds after the first epoch. `fastest_m`: by how much a fault may have
     changed since the row before, at its largest rate. `fresh`: nothing led here, so it may have done so unobserved.
     `free`: the averages are not known here, only that they were within their thresholds.
-    `gain_s`: metres of fault per m/s that the bank sees over the increment (its time over g, see `_share_observed`).
+    `gain_s`: metres of fault per m/s that the bank sees over the increment (its time over g of the curve).
     `rate_mps`: u. `least_mps`, `most_mps`: bounds of y by the raw monitor and the largest rate of a fault.
     `weight`, `average_mps`, `threshold_mps` (m, averages): alpha(dt), what each average was, and its threshold.
     `low_m`, `high_m`: bounds of the fault itself by monitors without memory. `anchor`: row that a re-link held this one
@@ -64,11 +64,11 @@ class Watched:
     learned_late_m: Floats
 
     @property
-    def rows(self) -> int:
+    def count(self) -> int:
         """How many rows."""
         return self.epoch.size
 
-    def mirrored(self) -> Watched:
+    def in_other_direction(self) -> Watched:
         """The same for errors in the other direction: what bounds them behind bounds these ahead."""
         return replace(
             self,
@@ -83,25 +83,25 @@ class Watched:
         )
 
     @property
-    def longest(self) -> tuple[int, int]:
+    def longest_stretch(self) -> tuple[int, int]:
         """First and last row of the longest stretch that the bank saw."""
-        edges = np.append(np.flatnonzero(self.fresh | (np.arange(self.rows) == 0)), self.rows)
+        edges = np.append(np.flatnonzero(self.fresh | (np.arange(self.count) == 0)), self.count)
         which = int(np.argmax(np.diff(edges)))
         return int(edges[which]), int(edges[which + 1]) - 1
 
-    def between(self, low: int, high: int) -> Watched:
+    def rows_between(self, low: int, high: int) -> Watched:
         """Rows [low, high); anchors before them are lost."""
         part = {item.name: getattr(self, item.name)[low:high] for item in fields(self)}
         part["anchor"] = np.where(part["anchor"] >= low, part["anchor"] - low, NO_ROW)
         return Watched(**part)
 
-    def since(self, start: int, end: int, fix_s: float = -np.inf) -> Watched:
+    def after_fix(self, start: int, end: int, fix_s: float = -np.inf) -> Watched:
         """The rows from `start` to `end` for a fault that began after `fix_s`, an instant before the second of them.
 
         Of the first increment only the time after `fix_s` has a fault: |y - u| <= df / gain with that share of df.
         """
-        window = self.between(start, end + 1)
-        if window.rows < 2 or fix_s <= window.t_s[0]:
+        window = self.rows_between(start, end + 1)
+        if window.count < 2 or fix_s <= window.t_s[0]:
             return window
         fastest = window.fastest_m.copy()
         least = window.least_mps.copy()
@@ -114,7 +114,7 @@ class Watched:
         return replace(window, fastest_m=fastest, least_mps=least, most_mps=most)
 
 
-def watched(
+def watch_rows(
     epochs: pl.DataFrame, bank: AxisBank, held: tuple[Held, ...], vehicle: Vehicle, config: Configuration
 ) -> Watched:
     """What the bank watched of a solution; `epochs`: aligned, with `negated`; `held`: the re-links that held.
@@ -129,11 +129,11 @@ def watched(
     t_s = (t_ns[epoch] - t_ns[0]) * 1e-9
     fresh = series.fresh[kept] | (np.diff(kept, prepend=-1) != 1)
     fastest_m = config.undetected.max_rate_mps * np.diff(t_s, prepend=t_s[:1])
-    gain_s = series.dt_s[kept] / _share_observed(epochs, epoch, config.undetected.hidden_share)
+    gain_s = series.dt_s[kept] / _least_share_observed(epochs, epoch, config.undetected.hidden_share)
     rate = series.rate_mps[kept]
     threshold = _thresholds(bank, epoch, config.undetected.max_rate_mps)
     alphas = np.array(config.monitors.ewma_alphas)[bank.enabled[1:]]
-    learned_m, learned_late_m = _learned(epochs, epoch, vehicle, config)
+    learned_m, learned_late_m = _hidden_by_learning(epochs, epoch, vehicle, config)
     endless = np.full(epoch.size, np.inf)
     rows = Watched(
         epoch=epoch,
@@ -169,7 +169,7 @@ def _thresholds(bank: AxisBank, epoch: Ints, fastest_mps: float) -> Floats:
     return np.nan_to_num(threshold, nan=np.inf, posinf=np.inf, neginf=np.inf)
 
 
-def _share_observed(epochs: pl.DataFrame, epoch: Ints, most: float) -> float:
+def _least_share_observed(epochs: pl.DataFrame, epoch: Ints, most: float) -> float:
     """How much of a fault the increments show, at least; one on straight track.
 
     `along_m` leaves out what a curve adds to the movement of a position y off the track (`alignment.align.unrolled`). A
@@ -180,7 +180,9 @@ def _share_observed(epochs: pl.DataFrame, epoch: Ints, most: float) -> float:
     return 1.0 - min(float(curvature.max(initial=0.0) * offset.max(initial=0.0)), most)
 
 
-def _learned(epochs: pl.DataFrame, epoch: Ints, vehicle: Vehicle, config: Configuration) -> tuple[Floats, Floats]:
+def _hidden_by_learning(
+    epochs: pl.DataFrame, epoch: Ints, vehicle: Vehicle, config: Configuration
+) -> tuple[Floats, Floats]:
     """How much of a fault a learned scale hides on the way to each row, and a learned latency at it [m].
 
     Both learn from the positions that the fault moves. They are taken to stay within the threshold factor times their
@@ -202,7 +204,7 @@ def _with_relinks(rows: Watched, held: tuple[Held, ...]) -> Watched:
     bounds = {name: getattr(rows, name).copy() for name in _RELINKED}
     for relink in held:
         row = int(np.searchsorted(rows.epoch, relink.epoch))
-        if row >= rows.rows or rows.epoch[row] != relink.epoch:
+        if row >= rows.count or rows.epoch[row] != relink.epoch:
             continue
         room_m = relink.bound_m + rows.learned_late_m[row]
         if relink.anchor_epoch is None:
@@ -244,15 +246,15 @@ class FaultWindow(NamedTuple):
     since_s: float
 
 
-def windows(rows: Watched, t_ns: Ints, fixes: Ints) -> list[FaultWindow]:
+def windows_between_fixes(rows: Watched, t_ns: Ints, fixes: Ints) -> list[FaultWindow]:
     """The windows of a run, in order; `t_ns`: stamps of all epochs."""
-    if not rows.rows:
+    if not rows.count:
         return []
     stamps = t_ns[rows.epoch]
     last = np.searchsorted(stamps, fixes, side="right") - 1
     # Of several fixes between two rows the last one counts.
     began = {0: int(stamps[0])} | dict(zip(last[last >= 0].tolist(), fixes[last >= 0].tolist(), strict=True))
-    ends = [*sorted(began)[1:], rows.rows - 1]
+    ends = [*sorted(began)[1:], rows.count - 1]
     return [
         FaultWindow(start, end, began[start], (began[start] - int(t_ns[0])) / NS_PER_S)
         for start, end in zip(sorted(began), ends, strict=True)

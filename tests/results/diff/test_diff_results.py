@@ -113,24 +113,24 @@ class TestHazards:
 class TestResults:
     def test_the_same(self, a: Path, tmp_path: Path) -> None:
         diff = diff_results(a, result(tmp_path / "b", tables()))
-        assert diff.same
+        assert diff.is_same
         assert diff.text() == "1 runs in both: all the same"
 
     def test_made_by_another_version_is_a_note(self, a: Path, tmp_path: Path) -> None:
         runs = table(Runs, 1, solution="primary", status="ok", availability=0.9, software="balise 2")
         diff = diff_results(a, result(tmp_path / "b", tables(runs=runs), software="balise 2"))
-        assert diff.same
+        assert diff.is_same
         assert diff.notes == ("software differs in 1 runs",)
 
     def test_a_lost_provenance_column_is_no_note(self, a: Path, tmp_path: Path) -> None:
         b = result(tmp_path / "b", tables())
         file = Path(table_address(b, "runs", "r1"))
         pl.read_parquet(file).drop("software").write_parquet(file)
-        assert not diff_results(a, b).same
+        assert not diff_results(a, b).is_same
 
     def test_runs_on_one_side_only(self, a: Path, tmp_path: Path) -> None:
         diff = diff_results(a, result(tmp_path / "b", tables(), tables("r2")))
-        assert not diff.same
+        assert not diff.is_same
         assert (diff.only_in_a, diff.only_in_b, diff.compared) == ((), ("r2",), 1)
         assert diff.text().splitlines() == ["1 runs in both: all the same, 1 only in B", "r2: only in B"]
 
@@ -151,7 +151,7 @@ class TestResults:
     )
     def test_a_change_in_any_table(self, name: str, frame: pl.DataFrame, said: str, a: Path, tmp_path: Path) -> None:
         diff = diff_results(a, result(tmp_path / "b", tables(**{name: frame})))
-        assert not diff.same
+        assert not diff.is_same
         assert said in diff.text(detail=True)
         assert diff.text().splitlines()[0] == "1 runs in both: 1 changed"
 
@@ -175,7 +175,7 @@ class TestResults:
 
     def test_below_the_tolerance_is_no_change(self, a: Path, tmp_path: Path) -> None:
         near = passages(2, solution="primary", balise_id=["VB1", "VB2"], location_error_m=[0.5 + 4e-7, 1.5])
-        assert diff_results(a, result(tmp_path / "b", tables(passages=near))).same
+        assert diff_results(a, result(tmp_path / "b", tables(passages=near))).is_same
 
     def test_as_json(self, a: Path, tmp_path: Path) -> None:
         b = result(tmp_path / "b", tables(hazards=found(size_m=[51.0, 30.0, -25.0])), tables("r2"))
@@ -232,7 +232,7 @@ class TestRules:
     ) -> None:
         compared = diff_results(a, b, rules_of(tolerances, ignored, None))
         assert {item.place for run in compared.runs for item in run.differences} == left
-        assert compared.same == (not left)
+        assert compared.is_same == (not left)
 
     def test_a_file_holds_the_same_and_the_command_adds_to_it(self, a: Path, b: Path, tmp_path: Path) -> None:
         file = tmp_path / "diff.toml"
@@ -240,13 +240,13 @@ class TestRules:
         assert {item.place for run in diff_results(a, b, rules_of([], [], file)).runs for item in run.differences} == {
             "runs.availability"
         }
-        assert diff_results(a, b, rules_of(["availability=0.01"], [], file)).same
+        assert diff_results(a, b, rules_of(["availability=0.01"], [], file)).is_same
 
     def test_a_verdict_that_is_not_compared_is_not_reported(self, a: Path, tmp_path: Path) -> None:
         unsafe = table(Runs, 1, solution="primary", status="ok", availability=0.9, verdict="unsafe")
         b = result(tmp_path / "b", tables(runs=unsafe))
         assert diff_results(a, b).runs[0].verdicts
-        assert diff_results(a, b, rules_of([], ["verdict"], None)).same
+        assert diff_results(a, b, rules_of([], ["verdict"], None)).is_same
 
     @pytest.mark.parametrize(
         ("tolerances", "ignored", "said"),

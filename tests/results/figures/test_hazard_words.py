@@ -7,7 +7,7 @@ from typing import Any
 import polars as pl
 import pytest
 
-from pipeline.results.figures.hazard_words import hazard_words, withstood
+from pipeline.results.figures.hazard_words import hazard_words, withstood_words
 from tests.tables import NS, hazards, passages
 
 JUMP: dict[str, Any] = {
@@ -75,7 +75,7 @@ def test_what_a_safe_run_withstood() -> None:
         t_onset=[NS, 10 * NS, 20 * NS, 90 * NS, 2 * NS],
         t_negated=[NS + NS // 10, 10 * NS + NS // 5, 51 * NS, None, 2 * NS],
     )
-    assert withstood(rows) == (
+    assert withstood_words(rows) == (
         "2 jumps negated within 0.2 s, 1 shift negated within 31 s, 1 shift that no monitor saw, none accepted"
     )
-    assert withstood(rows.clear()) == ""
+    assert withstood_words(rows.clear()) == ""

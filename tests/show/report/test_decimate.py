@@ -9,7 +9,7 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from pipeline.show.report.decimate import band, detail_rows, kept_rows
+from pipeline.show.report.decimate import detail_rows, kept_rows, state_band
 
 
 def test_short_series_stay_whole() -> None:
@@ -67,7 +67,7 @@ def test_detail_is_near_the_moments_and_within_its_limit() -> None:
 
 def test_pieces_of_a_band() -> None:
     t_ms = np.array([0, 100, 200, 300, 5000, 5100])
-    pieces = band(t_ms, np.array([1, 1, 2, 1, 1, 1]), hold_ms=1000, gap_code=0)
+    pieces = state_band(t_ms, np.array([1, 1, 2, 1, 1, 1]), hold_ms=1000, gap_code=0)
     assert pieces.starts_ms.tolist() == [0, 200, 300, 1300, 5000]
     assert pieces.codes.tolist() == [1, 2, 1, 0, 1]
     assert pieces.end_ms == 6100
@@ -78,7 +78,7 @@ def test_pieces_of_a_band() -> None:
 def test_the_worst_state_of_a_crowded_band_is_seen(codes: list[int], limit: int) -> None:
     """Wherever an epoch has a state, what is drawn there is at least as bad."""
     t_ms = np.arange(len(codes)) * 100
-    pieces = band(t_ms, np.array(codes), hold_ms=1000, gap_code=0, pieces=limit)
+    pieces = state_band(t_ms, np.array(codes), hold_ms=1000, gap_code=0, pieces=limit)
     assert len(pieces.starts_ms) <= max(limit, 1) or len(pieces.starts_ms) <= len(codes)
     drawn = pieces.codes[np.searchsorted(pieces.starts_ms, t_ms, side="right") - 1]
     assert np.all(drawn >= np.array(codes))
@@ -87,7 +87,7 @@ def test_the_worst_state_of_a_crowded_band_is_seen(codes: list[int], limit: int)
 
 def test_no_epochs_no_pieces() -> None:
     nothing = np.array([], dtype=np.int64)
-    assert len(band(nothing, nothing, 1000, 0).starts_ms) == 0
+    assert len(state_band(nothing, nothing, 1000, 0).starts_ms) == 0
 
 
 @pytest.mark.parametrize("size", [1, 2, 41])

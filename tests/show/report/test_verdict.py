@@ -10,7 +10,7 @@ import pytest
 from pipeline.results.store import write_run
 from pipeline.show.report import markup, write_report
 from pipeline.show.report.balises import balise_table
-from pipeline.show.report.markup import cell
+from pipeline.show.report.markup import value_cell
 from pipeline.stages.prepare import Provenance
 from pipeline.stages.run_row.summary import failed_row
 from schemas.campaign import CampaignBalises
@@ -143,10 +143,10 @@ def test_physical_balises_are_not_the_worst_for_want_of_a_judge() -> None:
 
 def test_ten_columns_are_shown_and_the_rest_behind_a_switch() -> None:
     heads = [(f"c{number}", "") for number in range(12)]
-    text = markup.table("t", "Many", heads, [[cell(number) for number in range(12)]])
+    text = markup.table("t", "Many", heads, [[value_cell(number) for number in range(12)]])
     assert re.findall(r'<th[^>]*class="number more"[^>]*>(\w+)<', text) == ["c10", "c11"]
     assert "all 12 columns" in text
-    assert "columns</label>" not in markup.table("t", "Few", heads[:10], [[cell(number) for number in range(10)]])
+    assert "columns</label>" not in markup.table("t", "Few", heads[:10], [[value_cell(number) for number in range(10)]])
 
 
 def test_all_reasons_stand_behind_it(report: Path) -> None:
@@ -191,4 +191,4 @@ def test_the_figures_stand_beside_every_verdict(report: Path) -> None:
 
 
 def test_numbers_of_a_list_are_rounded_as_others_are() -> None:
-    assert cell([0.448815736651947, 0.12], 4).text == "0.4488, 0.12"
+    assert value_cell([0.448815736651947, 0.12], 4).text == "0.4488, 0.12"

@@ -12,7 +12,7 @@ from datasets.demo import demo_scenario
 from datasets.scenario import OdometerSpec
 from datasets.trial import build_run, build_site
 from pipeline.one_run import replay
-from pipeline.studies.calibration.calibrate import Calibration, Observed, calibrate, calibration_of, sigma_keys
+from pipeline.studies.calibration.calibrate import Calibration, ObservedRun, calibrate, combine_runs, sigma_settings
 from pipeline.studies.calibration.sigmas import regress_sigmas, sigma_table, worst_fit
 from pipeline.studies.calibration.vehicle import RunEstimate
 from schemas.config import CalibrationConfig, Configuration, MonitorConfig, Vehicle
@@ -122,26 +122,26 @@ def test_sigmas_of_an_earlier_calibration_do_not_count(
     assert again.monitors == result.monitors
 
 
-def seen(run_id: str, noise_m: dict[str, tuple[float, ...]], alarms: tuple[str, ...] = ()) -> Observed:
-    return Observed(run_id, RunEstimate(1.0, 1e-4, 0.0, 0.01, 100), noise_m, None, alarms)
+def seen(run_id: str, noise_m: dict[str, tuple[float, ...]], alarms: tuple[str, ...] = ()) -> ObservedRun:
+    return ObservedRun(run_id, RunEstimate(1.0, 1e-4, 0.0, 0.01, 100), noise_m, None, alarms)
 
 
 def test_runs_that_failed_beyond_their_noise_are_named() -> None:
     runs = [seen("good", {}), seen("bad", {}, ("along_ewma_0p01",))]
-    assert calibration_of(runs, Vehicle(), Configuration()).alarms == {"bad": ("along_ewma_0p01",)}
+    assert combine_runs(runs, Vehicle(), Configuration()).alarms == {"bad": ("along_ewma_0p01",)}
 
 
 def test_the_loudest_run_counts_monitor_by_monitor_and_an_axis_unknown_to_all_stays_unset() -> None:
     one = seen("one", {"noise_along_m": (0.1, 0.1, 0.4, 0.4), "noise_cross_m": (0.0, 0.0, 0.0, 0.0)})
     other = seen("other", {"noise_along_m": (0.2, 0.3, 0.3, 0.3)})
-    found = calibration_of([one, other], Vehicle(), Configuration())
+    found = combine_runs([one, other], Vehicle(), Configuration())
     assert found.monitors == {"noise_along_m": (0.2, 0.3, 0.4, 0.4), "noise_cross_m": (0.0, 0.0, 0.0, 0.0)}
 
 
 def test_quieter_than_predicted_is_believed_only_where_no_noise_explains_it() -> None:
     (fit,) = regress_sigmas([monitored(1, 0.0, 0.7, spread=0.0)], FACTOR, CONFIG)
-    assert sigma_keys([fit], noisy=True) == {"sigma_intercept_m": 0.0, "sigma_slope": 1.0}
-    assert sigma_keys([fit], noisy=False)["sigma_slope"] == pytest.approx(0.7, rel=0.02)
+    assert sigma_settings([fit], noisy=True) == {"sigma_intercept_m": 0.0, "sigma_slope": 1.0}
+    assert sigma_settings([fit], noisy=False)["sigma_slope"] == pytest.approx(0.7, rel=0.02)
 
 
 def test_a_noisy_odometer_shows_in_the_sigma_of_the_velocity(fault_free: tuple[list[RunLog], Site]) -> None:

@@ -7,7 +7,7 @@ import pytest
 
 from pipeline.stages.monitors.axis import error_model
 from pipeline.stages.odometry.odometry import Odometry
-from pipeline.studies.calibration.vehicle import RunEstimate, estimate_run, pooled
+from pipeline.studies.calibration.vehicle import RunEstimate, estimate_run, pool_runs
 from schemas.arrays import Floats
 from schemas.config import MonitorConfig
 from tests.stages.alignment.straight import odometer_of, odometry_from
@@ -82,13 +82,13 @@ def test_too_little_data_gives_nothing() -> None:
 
 def test_pooling_by_hand() -> None:
     """Equal sigmas, runs that agree: the mean with sigma / sqrt(n). Runs that differ: their scatter stays."""
-    agree = pooled(np.array([1.0, 1.0, 1.0, 1.0]), np.full(4, 0.2))
+    agree = pool_runs(np.array([1.0, 1.0, 1.0, 1.0]), np.full(4, 0.2))
     assert [agree.value, agree.sigma] == pytest.approx([1.0, 0.1])
     # Two runs at -1 and 1 with sigma 0.1: between = (Q - 1) / (sum w - sum w^2 / sum w) = (200 - 1) / 100.
-    differ = pooled(np.array([-1.0, 1.0]), np.full(2, 0.1))
+    differ = pool_runs(np.array([-1.0, 1.0]), np.full(2, 0.1))
     assert differ.value == pytest.approx(0.0)
     assert differ.sigma == pytest.approx(np.sqrt((0.01 + 1.99) / 2.0 + 1.99))
-    alone = pooled(np.array([3.0]), np.array([0.4]))
+    alone = pool_runs(np.array([3.0]), np.array([0.4]))
     assert [alone.value, alone.sigma] == pytest.approx([3.0, 0.4])
 
 

@@ -16,11 +16,11 @@ from hypothesis import strategies as st
 
 import cli
 from pipeline.results import store
-from pipeline.studies.claim import claim, load_profile, read_areas
+from pipeline.studies.claim import assess_claim, load_profile, read_areas
 from pipeline.studies.claim.claim import claim_table
-from pipeline.studies.claim.front import Front, front_of, speed_errors
+from pipeline.studies.claim.front import FrontEnd, front_end_of, speed_errors
 from pipeline.studies.claim.requirements import ClaimJourney, requirements, tallies
-from pipeline.studies.claim.tally import ALWAYS, Demand, Kind, Tally, clusters_s, count_claims
+from pipeline.studies.claim.tally import ALWAYS, Demand, Kind, Tally, count_claims, group_lengths_s
 from pipeline.studies.tally import Compliance, Shown, trials_needed
 from schemas.config import Configuration
 from schemas.errors import ConfigError, SiteError
@@ -48,24 +48,24 @@ SITE = Site(
 
 
 def of_share(tally: Tally, share: float) -> Shown:
-    return Demand(Kind.SHARE, share).shown(tally)
+    return Demand(Kind.SHARE, share).assess(tally)
 
 
 def of_rate(tally: Tally, rate_per_h: float) -> Shown:
-    return Demand(Kind.RATE, rate_per_h).shown(tally)
+    return Demand(Kind.RATE, rate_per_h).assess(tally)
 
 
 def of_availability(tally: Tally, share: float, outside_s: float) -> Shown:
-    return Demand(Kind.AVAILABILITY, share, outside_s=outside_s).shown(tally)
+    return Demand(Kind.AVAILABILITY, share, outside_s=outside_s).assess(tally)
 
 
-def front(t_s: list[float], areas: pl.DataFrame | None = AREAS, run: dict[str, Any] = RUN, **columns: Any) -> Front:
+def front(t_s: list[float], areas: pl.DataFrame | None = AREAS, run: dict[str, Any] = RUN, **columns: Any) -> FrontEnd:
     """The train of the tables: 20 m each second along net element A."""
     frame = epochs(t_s, **({"netelement_id": "A", "measure_m": [20.0 * t for t in t_s]} | columns))
-    return front_of(frame, passages(), run, Configuration(), PROFILE.method, areas)
+    return front_end_of(frame, passages(), run, Configuration(), PROFILE.method, areas)
 
 
-def ten() -> Front:
+def ten() -> FrontEnd:
     """Five seconds on a main line, four in a node, and one without a position."""
     judgement = ["right"] * 4 + ["wrong", "right", "unknown", "right", "wrong", "unknown"]
     return front(
@@ -83,12 +83,12 @@ def test_ten_epochs_by_hand() -> None:
     limit = ClaimJourney("run", found, epochs([]), passages(), PROFILE).limit_m
     assert limit[:9].tolist() == [30.0] * 5 + [10.0] * 4
     # Kept 1, not known 0, broken -1. Epoch 8 is on the wrong track; of epoch 6 the evidence says nothing.
-    assert found.within(limit, np.inf)[:9].tolist() == [1, 1, 1, 1, -1, 1, 0, 1, -1]
-    assert found.within(np.inf, limit)[:9].tolist() == [1, 1, 1, 1, 0, -1, 0, 1, -1]
-    assert found.within(found.over_m, found.under_m).tolist() == [1, 1, 1, -1, -1, -1, 0, 1, -1, 0]
-    assert found.within(5.0, 5.0)[:5].tolist() == [1, 0, -1, -1, -1]
-    assert found.within(1.0, 1.0)[5:9].tolist() == [-1, 0, 1, -1]
-    assert found.output.tolist() == [True] * 9 + [False]
+    assert found.codes_within_m(limit, np.inf)[:9].tolist() == [1, 1, 1, 1, -1, 1, 0, 1, -1]
+    assert found.codes_within_m(np.inf, limit)[:9].tolist() == [1, 1, 1, 1, 0, -1, 0, 1, -1]
+    assert found.codes_within_m(found.over_m, found.under_m).tolist() == [1, 1, 1, -1, -1, -1, 0, 1, -1, 0]
+    assert found.codes_within_m(5.0, 5.0)[:5].tolist() == [1, 0, -1, -1, -1]
+    assert found.codes_within_m(1.0, 1.0)[5:9].tolist() == [-1, 0, 1, -1]
+    assert found.has_output.tolist() == [True] * 9 + [False]
 
 
 def test_ten_epochs_as_counts() -> None:
@@ -185,8 +185,8 @@ def test_what_few_runs_show() -> None:
     assert of_rate(Tally(held_s=3600.0, known_s=3600.0), 3.0).finding is Compliance.MET
     assert of_rate(Tally(held_s=3600.0, known_s=3600.0), 2.99).finding is Compliance.NOT_SHOWN
     assert of_rate(Tally(events=1, possible=1, held_s=3600.0, known_s=3600.0), 1e-10).finding is Compliance.NOT_MET
-    assert ALWAYS.shown(Tally(held_s=1e12, known_s=1e12)).finding is Compliance.NOT_SHOWN
-    assert ALWAYS.shown(Tally(events=1)).finding is Compliance.NOT_MET
+    assert ALWAYS.assess(Tally(held_s=1e12, known_s=1e12)).finding is Compliance.NOT_SHOWN
+    assert ALWAYS.assess(Tally(events=1)).finding is Compliance.NOT_MET
     # Five of five runs lost 60 s of at most an hour: at least 0.478 of the runs, 0.8 % of the time.
     lost = of_availability(Tally(trials=5, broken=5, held_s=9000.0, known_s=8000.0, longest_s=3600.0), 0.99998, 60.0)
     assert lost.finding is Compliance.NOT_MET
@@ -196,7 +196,7 @@ def test_what_few_runs_show() -> None:
 
 def test_exceedances_close_to_each_other_are_one_event() -> None:
     t_ns = np.array([0, 10, 310, 611]) * NS
-    assert clusters_s(t_ns, t_ns, 300.0) == [310.0, 0.0]
+    assert group_lengths_s(t_ns, t_ns, 300.0) == [310.0, 0.0]
     code = np.array([-1, 0, 0, -1])
     counts = count_claims("run", t_ns, np.ones(4), code, 300.0)
     # What is not known between them may hold another event.
@@ -207,7 +207,7 @@ def test_a_gap_of_the_log_is_time_of_which_nobody_knows() -> None:
     """100 runs of 100 s, each with 60 s without epochs: two in five draws are kept, and nothing is met."""
     seconds = [float(second) for second in (*range(20), *range(80, 101))]
     frame = epochs(seconds, netelement_id="A", measure_m=5.0, error_low_m=0.0, error_high_m=0.0)
-    found = front_of(frame, passages(), RUN, Configuration(), PROFILE.method, AREAS)
+    found = front_end_of(frame, passages(), RUN, Configuration(), PROFILE.method, AREAS)
     for one in requirements(PROFILE):
         if one.key not in (("front_accuracy", "mainline"), ("speed_accuracy", "all")):
             continue
@@ -225,7 +225,7 @@ def test_a_balise_without_a_first_estimate_is_not_known() -> None:
     seconds = [float(second) for second in (*range(6), *range(15, 20))]
     frame = epochs(seconds, error_low_m=0.0, error_high_m=0.0)
     balises = passages(3, status="accepted", kind="physical", t_offered=[2 * NS, 8 * NS, 30 * NS])
-    found = front_of(frame, balises, RUN, Configuration(), PROFILE.method)
+    found = front_end_of(frame, balises, RUN, Configuration(), PROFILE.method)
     asked = next(one for one in requirements(PROFILE) if one.key == ("after_balise", "physical"))
     total = sum((asked.count(ClaimJourney(str(run), found, frame, balises, PROFILE)) for run in range(60)), Tally())
     assert (total.trials, total.broken) == (60, 0)
@@ -234,7 +234,7 @@ def test_a_balise_without_a_first_estimate_is_not_known() -> None:
 
 def test_runs_of_one_day_are_one_trial_by_option(result: Path) -> None:
     method = PROFILE.method.model_copy(update={"independent": "day"})
-    found = claim(result, PROFILE.model_copy(update={"method": method}), areas=AREAS).table
+    found = assess_claim(result, PROFILE.model_copy(update={"method": method}), areas=AREAS).table
     node = found.filter((pl.col("requirement") == "front_accuracy") & (pl.col("applies_to") == "node"))
     assert node.select("trials", "hours").row(0) == (1, pytest.approx(2 * 5 / 3600))
     always = found.filter((pl.col("demanded") == "always") & (pl.col("hours") > 0) & (pl.col("finding") != "not met"))
@@ -256,7 +256,7 @@ def test_weaker_evidence_never_shows_what_stronger_refutes(runs: list[list[tuple
         strong += count_claims(str(number), t_ns, held, full, 300.0)
         weak += count_claims(str(number), t_ns, held, less, 300.0)
     fault_free = Tally(trials=1, kept=1, held_s=3600.0, known_s=3600.0)
-    for shown in (lambda c: of_share(c, 0.6), lambda c: of_rate(c, 8.0), ALWAYS.shown):
+    for shown in (lambda c: of_share(c, 0.6), lambda c: of_rate(c, 8.0), ALWAYS.assess):
         findings = (shown(strong).finding, shown(weak).finding)
         assert findings not in {
             (Compliance.NOT_MET, Compliance.MET),
@@ -275,7 +275,7 @@ def test_a_wider_interval_says_the_same_or_nothing(
     middle: float, half: float, more: float, other: float, limit: float
 ) -> None:
     low, high = [middle - half, middle - half - more], [middle + half, middle + half + other]
-    strong, weak = replace(TWO_EPOCHS, low_m=np.array(low), high_m=np.array(high)).within(limit, limit).tolist()
+    strong, weak = replace(TWO_EPOCHS, low_m=np.array(low), high_m=np.array(high)).codes_within_m(limit, limit).tolist()
     assert weak in (0, strong)
 
 
@@ -299,12 +299,12 @@ def test_the_odometer_goes_on_where_no_position_is_in_use() -> None:
         doubt_under_m=[None] * 5 + [17.0, 18.0, 19.0, 20.0, 21.0],
     )
     crossed = passages(1, balise_id="b", status="accepted", path_m=100.0, kind="virtual")
-    found = front_of(frame, crossed, RUN, Configuration(), PROFILE.method)
+    found = front_end_of(frame, crossed, RUN, Configuration(), PROFILE.method)
     assert found.path_m == pytest.approx([*true[:9], 140.0])
     assert found.over_m[6:].tolist() == [18.0, 19.0, 20.0, 21.0]
     assert found.low_m[[6, 9]] == pytest.approx([-0.5, -40.5])
     # Where GNSS is wrong the report of the odometer is never proved, but its error is seen.
-    assert found.within(found.over_m, found.under_m).tolist() == [1] * 6 + [0, 0, 0, -1]
+    assert found.codes_within_m(found.over_m, found.under_m).tolist() == [1] * 6 + [0, 0, 0, -1]
 
 
 def test_the_report_of_an_outage_is_compared_with_the_place_of_the_train() -> None:
@@ -332,11 +332,11 @@ def test_the_report_of_an_outage_is_compared_with_the_place_of_the_train() -> No
         doubt_under_m=[None] * 5 + [17.0, 18.0, 19.0, 20.0, 21.0],
     )
     crossed = passages(1, balise_id="b", status="accepted", path_m=100.0, kind="virtual")
-    front = front_of(frame, crossed, RUN, Configuration(), PROFILE.method)
+    front = front_end_of(frame, crossed, RUN, Configuration(), PROFILE.method)
     assert front.low_m[[6, 7, 9]] == pytest.approx([-0.5, -0.5, -40.5])
     assert front.high_m[[6, 7, 9]] == pytest.approx([0.5, 0.5, -39.5])
     # Kept where the place is known, unknown on one of two net elements, beyond its interval at the end.
-    assert front.within(front.over_m, front.under_m).tolist() == [1] * 8 + [0, -1]
+    assert front.codes_within_m(front.over_m, front.under_m).tolist() == [1] * 8 + [0, -1]
 
 
 def test_the_front_end_decides_on_the_area() -> None:
@@ -349,10 +349,10 @@ def test_the_front_end_decides_on_the_area() -> None:
         error_low_m=0.0,
         error_high_m=0.0,
     )
-    found = front_of(frame, passages(), RUN, Configuration(), PROFILE.method, AREAS, ahead_m=30.0)
+    found = front_end_of(frame, passages(), RUN, Configuration(), PROFILE.method, AREAS, ahead_m=30.0)
     assert ClaimJourney("run", found, frame, passages(), PROFILE).limit_m.tolist() == [30.0] * 5 + [10.0] * 5
-    assert found.output.all()
-    assert found.within(5.0, 5.0).tolist() == [1] * 10
+    assert found.has_output.all()
+    assert found.codes_within_m(5.0, 5.0).tolist() == [1] * 10
 
 
 def test_latency_widens_the_safe_front_end() -> None:
@@ -372,9 +372,9 @@ def test_speed_against_the_evidence() -> None:
     assert found.fastest_kmh == pytest.approx([75.6])
     assert (found.low_kmh[0], found.high_kmh[0]) == pytest.approx((3.24, 3.96))
     limit = PROFILE.safe_speed.limit_kmh(found.fastest_kmh)  # 2 + 45.6 / 47 = 2.970 km/h
-    assert found.within(limit, limit).tolist() == [-1]
+    assert found.codes_within_kmh(limit, limit).tolist() == [-1]
     wide = speed_errors(front(seconds, speed_mps=21.0, error_low_m=-3.0, error_high_m=3.0), 10.0)
-    assert wide.within(limit, limit).tolist() == [0]
+    assert wide.codes_within_kmh(limit, limit).tolist() == [0]
 
 
 def test_a_limit_of_speed_is_that_of_the_fastest_instant() -> None:
@@ -388,9 +388,9 @@ def test_a_limit_of_speed_is_that_of_the_fastest_instant() -> None:
     )
     assert found.fastest_kmh == pytest.approx([200.0])
     limit = PROFILE.safe_speed.limit_kmh(found.fastest_kmh)
-    assert found.within(limit, limit).tolist() == [1]
+    assert found.codes_within_kmh(limit, limit).tolist() == [1]
     at_mean = PROFILE.safe_speed.limit_kmh(np.array([110.0]))
-    assert found.within(at_mean, at_mean).tolist() == [-1]
+    assert found.codes_within_kmh(at_mean, at_mean).tolist() == [-1]
 
 
 def test_a_mean_speed_is_late_while_the_train_speeds_up() -> None:
@@ -403,7 +403,7 @@ def test_a_mean_speed_is_late_while_the_train_speeds_up() -> None:
     # 0.5 m/s ± 0.02 by the evidence ± 1 s · 10 m/s / 10 s.
     assert (found.low_kmh[0] / 3.6, found.high_kmh[0] / 3.6) == pytest.approx((-1.52, 0.52))
     limit = PROFILE.speed.limit_kmh(found.fastest_kmh)
-    assert found.within(limit, limit).tolist() == [0]
+    assert found.codes_within_kmh(limit, limit).tolist() == [0]
 
 
 def test_means_of_speed_call_no_accuracy_met() -> None:
@@ -417,7 +417,7 @@ def test_means_of_speed_call_no_accuracy_met() -> None:
         rides = [ClaimJourney(f"{number}", found, frame, nothing, PROFILE) for number in range(300)]
         counts = sum((asked.count(journey) for journey in rides), Tally())
         assert (counts.trials, counts.kept, counts.broken) in ((300, 300, 0), (300, 0, 300))
-        assert asked.demand.shown(counts).finding == finding
+        assert asked.demand.assess(counts).finding == finding
 
 
 def test_after_a_balise_start_and_availability() -> None:
@@ -427,7 +427,7 @@ def test_after_a_balise_start_and_availability() -> None:
     frame = epochs(seconds, in_use=[not gone for gone in lost], error_low_m=0.29, error_high_m=0.31, tvb=False)
     balise = passages(1, status="accepted", kind="physical", t_offered=[2 * NS])
     found = tallies(
-        ClaimJourney("run", front_of(frame, balise, RUN, Configuration(), PROFILE.method), frame, balise, PROFILE)
+        ClaimJourney("run", front_end_of(frame, balise, RUN, Configuration(), PROFILE.method), frame, balise, PROFILE)
     )
     assert found["after_balise", "physical"].broken == 1
     assert found["after_balise", "virtual"].trials == 0
@@ -441,7 +441,7 @@ def test_a_run_without_epochs_says_nothing() -> None:
     nothing = epochs([], t=[], path_m=[], odometer_m=[])
     found = tallies(
         ClaimJourney(
-            "run", front_of(nothing, passages(), RUN, Configuration(), PROFILE.method), nothing, passages(), PROFILE
+            "run", front_end_of(nothing, passages(), RUN, Configuration(), PROFILE.method), nothing, passages(), PROFILE
         )
     )
     table = claim_table({"primary": found}, PROFILE)
@@ -508,7 +508,7 @@ def result(tmp_path: Path) -> Path:
 
 
 def test_a_result_with_and_without_areas(result: Path) -> None:
-    found = claim(result, PROFILE, areas=AREAS)
+    found = assess_claim(result, PROFILE, areas=AREAS)
     rows = {(row["requirement"], row["applies_to"]): row for row in found.table.iter_rows(named=True)}
     assert set(rows) == {one.key for one in requirements(PROFILE)}
     # The error lies from 200 m on, in the precise area; both runs count their hours, one its evidence.
@@ -524,7 +524,7 @@ def test_a_result_with_and_without_areas(result: Path) -> None:
     assert rows["cold_movement", "all"]["reason"] == "a train without power records nothing"
     assert any("1 of 2 runs have neither a reference" in note for note in found.notes)
     assert any("2 settings or vehicle files: trains may differ" in note for note in found.notes)
-    without = claim(result, PROFILE)
+    without = assess_claim(result, PROFILE)
     assert any("Without areas" in note for note in without.notes)
     by_area = without.table.filter(pl.col("applies_to").is_in(["mainline", "dense_line", "node", "precise"]))
     assert set(by_area["finding"]) == {"not shown"}

@@ -11,7 +11,7 @@ from datasets.scenario import Scenario
 from datasets.trial import write_trial
 from pipeline.campaign import make_plan, run_campaign
 from pipeline.read.site.read import read_site
-from pipeline.studies.claim import claim, load_profile, read_areas
+from pipeline.studies.claim import assess_claim, load_profile, read_areas
 from schemas.config import Configuration, settings_from
 
 MOTION = {"start_m": 200.0, "phases": [{"speed_mps": 30.0, "acceleration_mps2": 1.0, "hold_m": 1200.0}]}
@@ -47,7 +47,7 @@ def test_a_step_exceeds_mapo_once_and_a_clean_run_never(tmp_path: Path) -> None:
             [str(tmp_path / "runs" / run)], str(tmp_path / "site"), str(out), Configuration(), scenario.vehicle
         )
         run_campaign(plan, jobs=1)
-        table = claim(out, load_profile("lu-2023"), site, read_areas(tmp_path / "site", site)).table
+        table = assess_claim(out, load_profile("lu-2023"), site, read_areas(tmp_path / "site", site)).table
         assert "met" not in set(table["finding"])
         mapo = table.filter(pl.col("requirement").is_in(["mapo", "safe_front_end"])).filter(pl.col("events") > 0)
         events[run] = mapo.select("requirement", "applies_to", "finding", "events").rows()

@@ -10,7 +10,7 @@ import polars as pl
 
 from pipeline.stages.track.geodesy import moved_deg
 from pipeline.studies.line.passes import PieceIndex, passes_of
-from pipeline.studies.line.pieces import Pieces, middles, pieces_of
+from pipeline.studies.line.pieces import Pieces, middles_in_plane_m, pieces_of
 from schemas.config import Configuration
 from schemas.conform import dtypes
 from schemas.inputs import Links, Track
@@ -141,7 +141,7 @@ def no_passages() -> pl.DataFrame:
 
 def ground_of_line(site: Site, criteria: LineCriteria = CRITERIA) -> PieceIndex:
     pieces = pieces_of(site, criteria.piece_m)
-    return PieceIndex.of(site, pieces, middles(site, pieces))
+    return PieceIndex.of_pieces(site, pieces, middles_in_plane_m(site, pieces))
 
 
 def passes_over(epochs: Sequence[pl.DataFrame], site: Site, criteria: LineCriteria = CRITERIA) -> pl.DataFrame:

@@ -7,7 +7,7 @@ import pytest
 
 from pipeline.studies.line.classes import piece_classes
 from pipeline.studies.line.spans import SpanState
-from pipeline.studies.tally import distinct, trials_needed
+from pipeline.studies.tally import trials_needed, without_repeated_journeys
 from schemas.line import LineCriteria
 from schemas.run import Site
 from tests.studies.line.tables import (
@@ -161,12 +161,12 @@ def test_one_journey_counts_once() -> None:
             "distance_m": [1000.0, 1001.0, 1000.0],
         }
     )
-    kept, said = distinct(runs)
+    kept, said = without_repeated_journeys(runs)
     assert kept["run_id"].to_list() == ["b", "c"]
     assert [text.partition(" runs ")[0] for text in said] == ["1", "1"]
     assert "begin and end together with another run" in said[0]
     assert "overlap in time" in said[1]
-    once, said = distinct(kept.filter(pl.col("run_id") != "c"))
+    once, said = without_repeated_journeys(kept.filter(pl.col("run_id") != "c"))
     assert (once["run_id"].to_list(), said) == (["b"], [])
 
 
@@ -174,7 +174,7 @@ def test_two_trains_logged_over_the_same_hour_are_two_journeys() -> None:
     runs = pl.DataFrame(
         {"run_id": ["a", "b"], "solution": "primary", "verdict": "safe", "t_start": 0, "t_end": 3600}
     ).with_columns(distance_m=pl.Series([30_000.0, 24_000.0]))
-    assert distinct(runs)[0]["run_id"].to_list() == ["a", "b"]
+    assert without_repeated_journeys(runs)[0]["run_id"].to_list() == ["a", "b"]
 
 
 @pytest.mark.parametrize(("begin", "overlapping"), [(59, ["1"]), (60, []), (61, [])])
@@ -190,7 +190,7 @@ def test_runs_that_overlap_in_time_are_remarked_on(begin: int, overlapping: list
             "distance_m": 1000.0,
         }
     )
-    kept, said = distinct(runs)
+    kept, said = without_repeated_journeys(runs)
     assert kept.height == 3
     assert [text.partition(" runs overlap")[0] for text in said] == overlapping
 

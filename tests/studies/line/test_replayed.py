@@ -13,7 +13,7 @@ from pipeline import replay
 from pipeline.read.ingest import read_run
 from pipeline.read.site.read import read_site
 from pipeline.studies.line.passes import PieceIndex, passes_of
-from pipeline.studies.line.pieces import middles, pieces_of
+from pipeline.studies.line.pieces import middles_in_plane_m, pieces_of
 from schemas.config import Configuration, settings_from
 from schemas.line import LineCriteria
 
@@ -44,7 +44,7 @@ def replayed(scenario: Scenario, folder: Path) -> tuple[pl.DataFrame, pl.DataFra
     site, config, criteria = read_site(folder / "site"), Configuration(), LineCriteria()
     tables = replay(read_run(path, config.ingest), site, scenario.vehicle, config)
     pieces = pieces_of(site, criteria.piece_m)
-    ground = PieceIndex.of(site, pieces, middles(site, pieces))
+    ground = PieceIndex.of_pieces(site, pieces, middles_in_plane_m(site, pieces))
     passes = passes_of(tables.epochs, tables.passages, tables.alarms, ground, criteria, config)
     return tables.epochs, passes.with_columns(from_m=pl.Series(pieces.from_m[passes["piece"].to_numpy()]))
 

@@ -9,7 +9,7 @@ import polars as pl
 import pytest
 
 from pipeline.results.store import write_config, write_run
-from pipeline.show.assessment import for_reading
+from pipeline.show.assessment import tables_for_reading
 from pipeline.studies.safety.assessment import Assessment, alarm_causes, assess
 from schemas.config import Configuration
 from schemas.run import RunTables
@@ -179,7 +179,7 @@ def test_other_service_levels_leave_the_limits_of_the_result_alone(tmp_path: Pat
 
 
 def test_for_reading_leaves_out_what_is_empty_or_of_single_runs(found: Assessment) -> None:
-    shown = for_reading(found.tables)
+    shown = tables_for_reading(found.tables)
     assert "places where the map is in doubt" in shown
     assert all(frame.height for frame in shown.values())
     figures = shown["figures of primary, with exact 95 % bounds"]

@@ -8,7 +8,7 @@ from typing import Any
 import polars as pl
 
 from pipeline.results.store import write_run
-from pipeline.studies.safety.sensitivity import at_level, sensitivity
+from pipeline.studies.safety.sensitivity import runs_at_level, vary_keys
 from schemas.config import Configuration
 from schemas.run import RunTables
 from schemas.tables import TABLES, Runs
@@ -33,7 +33,7 @@ def runs(**changed: Any) -> pl.DataFrame:
 
 
 def verdict_at(allowed_s: float, **changed: Any) -> tuple[str, int, int]:
-    row = at_level(runs(**changed), allowed_s, Configuration()).row(0, named=True)
+    row = runs_at_level(runs(**changed), allowed_s, Configuration()).row(0, named=True)
     return row["verdict"], row["failures_within_budget"], row["failures_beyond_budget"]
 
 
@@ -48,7 +48,7 @@ def test_a_wrong_acceptance_stays_unsafe_at_any_level() -> None:
 
 
 def test_a_failed_run_has_no_verdict() -> None:
-    row = at_level(runs(status="failed", verdict=None), 100.0, Configuration()).row(0, named=True)
+    row = runs_at_level(runs(status="failed", verdict=None), 100.0, Configuration()).row(0, named=True)
     assert row["verdict"] is None
 
 
@@ -60,7 +60,7 @@ def test_one_table_says_where_each_row_comes_from(tmp_path: Path) -> None:
         empty = {name: schema.create_empty() for name, schema in TABLES.items() if name != "runs"}
         write_run(RunTables("r", runs=runs(verdict="safe").drop("run_id"), **empty), out, {})
 
-    without, found = (sensitivity(runs(), Configuration(), again) for again in (None, replay))
+    without, found = (vary_keys(runs(), Configuration(), again) for again in (None, replay))
     needed = without.filter(pl.col("how") == "needs --logs")
     assert needed.select("key", "value").rows() == [
         *(("failure_limit_m", "10"), ("failure_limit_m", "30")),

@@ -10,7 +10,7 @@ import pytest
 
 from pipeline.stages.run_row.bounds import clopper_pearson
 from pipeline.studies.safety.side_by_side import side_by_side
-from pipeline.studies.safety.tally import COMPOSITE, REACTIVE, REDUNDANT, added, architecture_figures
+from pipeline.studies.safety.tally import COMPOSITE, REACTIVE, REDUNDANT, add_counts, architecture_figures
 from schemas.config import Configuration
 from schemas.tables import Runs
 from tests.tables import NS, alarms, epochs, hazards, table
@@ -329,7 +329,7 @@ def test_tallies_of_runs_add_up() -> None:
     faults = rows_of(fault("gps", 100, 109))
     one = side_by_side(pl.concat([solution("gps", {105: BEYOND}), solution("galileo")]), faults, alarms(), runs, CONFIG)
     two = side_by_side(pl.concat([solution("gps"), solution("galileo")]), faults, alarms(), runs, CONFIG)
-    counts = added([one, two])
+    counts = add_counts([one, two])
     rows = {(row["solution"], row["architecture"]): row for row in architecture_figures(counts).iter_rows(named=True)}
     total = rows["galileo", COMPOSITE]
     assert (total["runs"], total["failures"], total["missed"], total["missed_share"]) == (2, 2, 1, 0.5)

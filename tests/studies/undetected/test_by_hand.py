@@ -11,9 +11,9 @@ import pytest
 from pipeline.stages.lds.link_monitors import Held
 from pipeline.stages.monitors.pseudorange import Equations
 from pipeline.studies.undetected import spacing
-from pipeline.studies.undetected.position_tests import _worst, bounded
+from pipeline.studies.undetected.position_tests import _worst_satellites_m, with_bounds
 from pipeline.studies.undetected.spacing import largest_spacing
-from pipeline.studies.undetected.watched import Watched, _with_relinks, windows
+from pipeline.studies.undetected.watched import Watched, _with_relinks, windows_between_fixes
 from schemas.config import Configuration
 from tests.studies.undetected.oracle import watched
 from tests.studies.undetected.test_errors import constant
@@ -88,9 +88,9 @@ def held_at(epoch: int, anchor_epoch: int | None, moved_m: float, bound_m: float
 
 def test_bounds_keep_the_nearer_one_and_turn_with_the_direction() -> None:
     rows = watched(constant(10, 0.01, 0.02))
-    both = bounded(bounded(rows, np.full(10, -4.0), np.full(10, 9.0)), np.full(10, -6.0), np.full(10, 3.0))
+    both = with_bounds(with_bounds(rows, np.full(10, -4.0), np.full(10, 9.0)), np.full(10, -6.0), np.full(10, 3.0))
     assert (both.low_m[0], both.high_m[0]) == (-4.0, 3.0)
-    assert (both.mirrored().low_m[0], both.mirrored().high_m[0]) == (-3.0, 4.0)
+    assert (both.in_other_direction().low_m[0], both.in_other_direction().high_m[0]) == (-3.0, 4.0)
 
 
 def test_windows_begin_at_the_last_fix_before_a_row() -> None:
@@ -98,7 +98,7 @@ def test_windows_begin_at_the_last_fix_before_a_row() -> None:
     rows = watched(constant(10, 0.01, 0.02))
     t_ns = np.arange(10, dtype=np.int64) * 10**9
     fixes = (np.array([-5.0, 2.2, 2.8, 7.0, 20.0]) * 1e9).astype(np.int64)
-    parts = [(part.start, part.end, part.since_s) for part in windows(rows, t_ns, fixes)]
+    parts = [(part.start, part.end, part.since_s) for part in windows_between_fixes(rows, t_ns, fixes)]
     assert parts == [(0, 2, 0.0), (2, 7, 2.8), (7, 9, 7.0)]
 
 
@@ -119,6 +119,6 @@ def test_one_range_may_move_the_position_by_its_gain_and_the_room_under_the_thre
         freedom=np.array([1, 0]),
         along=np.tile([1.0, 0.0, 0.0], (2, 1)),
     )
-    low, high = _worst(part, np.array([8.0, np.inf]))
+    low, high = _worst_satellites_m(part, np.array([8.0, np.inf]))
     assert (low[0], high[0]) == (pytest.approx(-2.0), pytest.approx(2.0))
     assert (low[1], high[1]) == (-np.inf, np.inf)

@@ -11,9 +11,9 @@ import pytest
 from pipeline.studies.undetected.error import largest_errors
 from pipeline.studies.undetected.exact import largest_profile
 from pipeline.studies.undetected.spacing import largest_spacing, splits_anywhere
-from pipeline.studies.undetected.splits import growth_with
+from pipeline.studies.undetected.splits import bound_growth_with
 from pipeline.studies.undetected.steps_and_ramps import Shape, largest_of_shape
-from pipeline.studies.undetected.stretch import paid_m, stretch_after
+from pipeline.studies.undetected.stretch import payments_m, stretch_after
 from schemas.arrays import Floats
 from schemas.config import Configuration, UndetectedConfig
 from tests.studies.undetected.oracle import Rows, beyond, optimum, recursions, rows, watched
@@ -41,7 +41,7 @@ def test_optimum_and_bound_are_those_of_the_definition(seed: int, size: int, res
 
 def test_behind_is_ahead_of_the_mirrored_record() -> None:
     window = rows(np.random.default_rng(5), 40)
-    behind = largest_profile(watched(window).mirrored()).error_m
+    behind = largest_profile(watched(window).in_other_direction()).error_m
     window.rate_mps, window.start_mps = -window.rate_mps, -window.start_mps
     assert behind == pytest.approx(optimum(window), abs=1e-5)
 
@@ -108,7 +108,7 @@ def test_a_relink_bounds_the_fault_against_its_anchor() -> None:
     anchor, high = np.full(31, -1), np.full(31, np.inf)
     anchor[20], high[20] = 10, 3.0
     seen = replace(watched(window), anchor=anchor, held_high_m=high, held_low_m=-high)
-    found, bound = largest_profile(seen.since(0, 20)).error_m, bounds(seen.since(0, 20)).most_m
+    found, bound = largest_profile(seen.after_fix(0, 20)).error_m, bounds(seen.after_fix(0, 20)).most_m
     # Ten rows by hand as above, and three metres.
     assert found == pytest.approx(0.5 + 0.09 + 3.0, abs=1e-6)
     assert bound[9] == pytest.approx(0.59, abs=1e-6)
@@ -119,11 +119,11 @@ def test_a_fault_after_a_fix_between_two_rows_has_only_the_time_since() -> None:
     window = constant(12, 0.01, 0.02)
     window.largest_mps, window.dt_s[1] = 0.001, 50.0
     # By hand: 1 mm/s over the 8 s since the fix, and over ten rows of 1 s.
-    seen = watched(window).since(0, 11, watched(window).t_s[1] - 8.0)
+    seen = watched(window).after_fix(0, 11, watched(window).t_s[1] - 8.0)
     assert bounds(seen).most_m[-1] == pytest.approx(0.018, abs=1e-9)
     assert largest_profile(seen).error_m == pytest.approx(0.018, abs=1e-6)
     fresh = replace(watched(window), fresh=np.arange(12) == 1)
-    assert bounds(fresh.since(0, 1, fresh.t_s[1] - 8.0)).most_m[-1] == pytest.approx(0.008, abs=1e-12)
+    assert bounds(fresh.after_fix(0, 1, fresh.t_s[1] - 8.0)).most_m[-1] == pytest.approx(0.008, abs=1e-12)
 
 
 def test_starts_that_were_not_tried_leave_no_shorter_spacing() -> None:
@@ -134,9 +134,11 @@ def test_starts_that_were_not_tried_leave_no_shorter_spacing() -> None:
         "undetected": {"spacing_step_s": 50.0, "spacing_resolution_s": 0.0},
     }
     found, before_m = largest_spacing(seen, way_m, Configuration.model_validate(settings))
-    ways, grow = [], partial(growth_with, splits=splits_anywhere(seen))
+    ways, grow = [], partial(bound_growth_with, splits=splits_anywhere(seen))
     for start in range(59):
-        most = np.maximum(*(bounds(one.since(start, 59), grow=grow).most_m for one in (seen, seen.mirrored())))
+        most = np.maximum(
+            *(bounds(one.after_fix(start, 59), grow=grow).most_m for one in (seen, seen.in_other_direction()))
+        )
         beyond = np.append(np.flatnonzero(most > limit_m), most.size)[0]
         if beyond < most.size:
             ways.append(way_m[start + beyond] - way_m[start])
@@ -159,7 +161,7 @@ def test_any_split_bounds_the_growth() -> None:
     for _ in range(50):
         shares = rng.normal(0.25, 1.0, (39, 4))
         shares[:, 0] += 1.0 - shares.sum(axis=1)
-        assert paid_m(stretch, shares)[-1].sum() - stretch.recorded_m[-1] >= most
+        assert payments_m(stretch, shares)[-1].sum() - stretch.recorded_m[-1] >= most
 
 
 def test_a_learned_scale_adds_its_way() -> None:

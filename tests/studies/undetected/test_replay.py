@@ -16,7 +16,7 @@ from datasets.scenario import Scenario
 from datasets.trial import build_run, build_site
 from pipeline.one_run import monitor_alone, replay
 from pipeline.stages.monitored import MonitoredSolution
-from pipeline.studies.undetected.columns import rows_of
+from pipeline.studies.undetected.columns import watched_rows
 from pipeline.studies.undetected.error import largest_errors
 from pipeline.studies.undetected.position_tests import range_bounds
 from schemas.arrays import Floats, Ints
@@ -100,8 +100,8 @@ def since_the_start(
 ) -> tuple[Floats, Ints, MonitoredSolution]:
     """The largest errors ahead since the first row, their epochs, and what watched."""
     monitored = monitor_alone(run, site, vehicle, settings, "primary")
-    rows = rows_of(monitored)
-    return largest_errors(rows.since(0, rows.rows - 1), settings.undetected).most_m, rows.epoch[1:], monitored
+    rows = watched_rows(monitored)
+    return largest_errors(rows.after_fix(0, rows.count - 1), settings.undetected).most_m, rows.epoch[1:], monitored
 
 
 def test_no_vehicle_file_no_close_bound() -> None:
