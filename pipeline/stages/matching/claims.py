@@ -410,5 +410,6 @@ def _hindsight(left: _LinesLeft, step: Ints, group: Ints, alone: Floats) -> Floa
 def _alone(found: PathSet) -> Floats:
     """Steps at which one line alone is within reach."""
     lines = found.groups[found.candidates.element]
-    pairs = np.unique(np.column_stack([found.candidates.step, lines]), axis=0)
-    return np.asarray(np.bincount(pairs[:, 0], minlength=len(found.steps)) == 1, dtype=np.float64)
+    most = found.network.count
+    pairs = np.unique(found.candidates.step * most + lines)
+    return np.asarray(np.bincount(pairs // most, minlength=len(found.steps)) == 1, dtype=np.float64)
