@@ -62,7 +62,7 @@ def position_changes(
 
 def find_jumps(steps: PositionChanges, direction: Ints, config: HazardConfig) -> list[Jump]:
     """Jumps in order of time: where the changes within a window exceed the limit, in either direction."""
-    largest_m = _largest_changes_m(steps, config)
+    largest_m = largest_changes_m(steps, config)
     jumps: list[Jump] = []
     for sign in (1.0, -1.0):
         for begin, end in spans_of(largest_m * sign > config.limits.jump_m):
@@ -72,22 +72,41 @@ def find_jumps(steps: PositionChanges, direction: Ints, config: HazardConfig) ->
     return sorted(jumps, key=lambda jump: jump[:2])
 
 
-def _largest_changes_m(steps: PositionChanges, config: HazardConfig) -> Floats:
+def largest_changes_m(steps: PositionChanges, config: HazardConfig) -> Floats:
     """The largest signed change [m] up to each position, over the positions in the window before it.
 
-    The one just before always counts. Lag by lag: as soon as no pair of positions so far apart is in the window, no
-    longer lag has one.
+    The one just before always counts. Zero where all positions about it are within the limit of a jump.
     """
     excess_m = steps.excess_m
-    largest_m = np.zeros(excess_m.size)
-    if excess_m.size < 2 or np.ptp(excess_m) <= config.limits.jump_m:
+    count = excess_m.size
+    largest_m = np.zeros(count)
+    if count < 2 or np.ptp(excess_m) <= config.limits.jump_m:
         return largest_m
     window_ns = round(config.jump_window_s * NS_PER_S)
-    chain = np.cumsum(~steps.linked)
+    # In blocks as long as the longest window: those before a position are in its block or the one before.
+    longest = int((np.arange(count) - np.searchsorted(steps.t_ns, steps.t_ns - window_ns)).max())
+    begins = np.arange(0, count, max(longest, 1))
+    most_m, least_m = np.maximum.reduceat(excess_m, begins), np.minimum.reduceat(excess_m, begins)
+    most_m[1:], least_m[1:] = np.maximum(most_m[1:], most_m[:-1]), np.minimum(least_m[1:], least_m[:-1])
+    ends = np.append(begins[1:], count)
+    chain = np.cumsum(~steps.linked, dtype=np.int64)
+    for first, last in spans_of(~(most_m - least_m <= config.limits.jump_m)):
+        before = int(begins[max(first - 1, 0)])
+        part = slice(before, int(ends[last]))
+        of_part_m = _largest_changes_within_m(excess_m[part], steps.t_ns[part], chain[part], window_ns)
+        largest_m[begins[first] : ends[last]] = of_part_m[begins[first] - before :]
+    return largest_m
+
+
+def _largest_changes_within_m(excess_m: Floats, t_ns: Ints, chain: Ints, window_ns: int) -> Floats:
+    """The same among some positions, lag by lag: as soon as no pair so far apart is in the window, no longer lag has
+    one.
+    """
+    largest_m = np.zeros(excess_m.size)
     for lag in range(1, excess_m.size):
         near = chain[lag:] == chain[:-lag]
         if lag > 1:
-            near &= steps.t_ns[lag:] - steps.t_ns[:-lag] <= window_ns
+            near &= t_ns[lag:] - t_ns[:-lag] <= window_ns
         if not near.any():
             break
         step_m = np.where(near, excess_m[lag:] - excess_m[:-lag], 0.0)

@@ -416,5 +416,6 @@ def _confidence_in_hindsight(left: _LinesLeft, step: Ints, group: Ints, alone: F
 def _have_one_line(found: PathSet) -> Floats:
     """1 at steps at which one line alone is within reach, else 0."""
     lines = found.groups[found.candidates.element]
-    pairs = np.unique(np.column_stack([found.candidates.step, lines]), axis=0)
-    return np.asarray(np.bincount(pairs[:, 0], minlength=len(found.steps)) == 1, dtype=np.float64)
+    most = found.network.count
+    pairs = np.unique(found.candidates.step * most + lines)
+    return np.asarray(np.bincount(pairs // most, minlength=len(found.steps)) == 1, dtype=np.float64)

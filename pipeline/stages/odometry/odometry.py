@@ -12,7 +12,7 @@ import polars as pl
 from pipeline.stages.odometry.bound import LEAST_DOUBT_M, LOST_M, Bound, is_lost
 from pipeline.stages.odometry.driven import driven_or_left_m, evenly_driven, moving_steps, travelled_m
 from pipeline.stages.odometry.quantisation import KnownNoise, Noise, noise_of_rows, row_periods_s
-from pipeline.stages.odometry.reading import OdometerReading
+from pipeline.stages.odometry.reading import OdometerReading, StepTimes
 from pipeline.stages.odometry.rows import (
     Contradiction,
     StepDistances,
@@ -127,7 +127,11 @@ class Odometry:
 
     def travelled_at(self, t_ns: Ints) -> Floats:
         """Distance driven since the first row [m], to and fro; interpolated over gaps."""
-        return np.interp(self.seconds(t_ns), self.t_s, self._travelled_m)
+        return self._travelled_at_s(self.seconds(t_ns))
+
+    def _travelled_at_s(self, t_s: Floats) -> Floats:
+        """The same at instants in seconds."""
+        return np.interp(t_s, self.t_s, self._travelled_m)
 
     def moving_s_at(self, t_ns: Ints) -> Floats:
         """Time for which the train moved since the first row [s]."""
@@ -214,22 +218,22 @@ class Odometry:
 
         `now`: the reading at the later ends, if it was made already.
         """
-        before_s, now_s = self._steps_s(t_ns, latency_s)
-        before = self.read(before_s)
-        now = now or self.read(now_s)
-        distance = scale * (now.distance_m - before.distance_m)
-        return Increments(distance, scale * (now.speed_mps - before.speed_mps))
+        steps = self._steps_s(t_ns, latency_s)
+        now = now or self.read(steps.end_s)
+        distance = scale * (now.distance_m - steps.at_begins(now.distance_m, self.distance_at_s))
+        return Increments(distance, scale * (now.speed_mps - steps.at_begins(now.speed_mps, self.speed_at_s)))
 
     def driven(self, t_ns: Ints, scale: Floats, latency_s: Floats) -> Floats:
         """Distance driven between consecutive instants, to and fro [m]."""
-        begin_m, end_m = (np.interp(at_s, self.t_s, self._travelled_m) for at_s in self._steps_s(t_ns, latency_s))
-        return np.asarray(scale * (end_m - begin_m))
+        steps = self._steps_s(t_ns, latency_s)
+        end_m = self._travelled_at_s(steps.end_s)
+        return np.asarray(scale * (end_m - steps.at_begins(end_m, self._travelled_at_s)))
 
-    def _steps_s(self, t_ns: Ints, latency_s: Floats) -> tuple[Floats, Floats]:
+    def _steps_s(self, t_ns: Ints, latency_s: Floats) -> StepTimes:
         """Begin and end of the step to each instant, less the latency in use at its end; none at the first."""
         t_s = self.seconds(t_ns)
         now = t_s - latency_s
-        return np.concatenate([now[:1], t_s[:-1] - latency_s[1:]]), now
+        return StepTimes(np.concatenate([now[:1], t_s[:-1] - latency_s[1:]]), now)
 
     def bridged_m2_at(self, t_s: Floats) -> Floats:
         """Sum of the variances over bridged resets up to each instant [m^2]."""

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from functools import cached_property
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
@@ -14,6 +15,20 @@ from schemas.frozen import frozen
 if TYPE_CHECKING:
     from pipeline.stages.odometry.odometry import Odometry
     from pipeline.stages.odometry.quantisation import KnownNoise
+
+
+class StepTimes(NamedTuple):
+    """Begin and end of each step [s], shape (n,)."""
+
+    begin_s: Floats
+    end_s: Floats
+
+    def at_begins(self, at_ends: Floats, look_up: Callable[[Floats], Floats]) -> Floats:
+        """Figures at the begins: mostly those at the end of the step before, else looked up."""
+        before = np.concatenate([at_ends[:1], at_ends[:-1]])
+        others = np.flatnonzero(self.begin_s != np.concatenate([self.end_s[:1], self.end_s[:-1]]))
+        before[others] = look_up(self.begin_s[others])
+        return before
 
 
 @frozen(eq=False)

@@ -49,7 +49,9 @@ class Segments(Polyline):
     def _search_points(self, rows: Ints) -> tuple[Floats, Ints]:
         """Search points on some segments, and the segment of each: several on long ones, few on runs of short ones."""
         # Whether one is needed depends on the segment before.
-        some = np.union1d(rows, np.maximum(rows - 1, 0))
+        wanted = np.zeros(len(self), dtype=np.bool_)
+        wanted[rows] = True
+        some = np.flatnonzero(wanted | np.append(wanted[1:], False))
         pieces = np.maximum(1, np.ceil(self.length_m[some] / (0.25 * PROBE_SPACING_M))).astype(np.int64)
         segment = np.repeat(some, pieces)
         # Number of each point within its segment.
@@ -60,7 +62,7 @@ class Segments(Polyline):
         bucket = np.floor(place / (0.75 * PROBE_SPACING_M))
         new = np.ones(len(segment), dtype=np.bool_)
         new[1:] = (bucket[1:] != bucket[:-1]) | (np.diff(self.element[segment]) != 0)
-        kept = np.flatnonzero(new & np.isin(segment, rows))
+        kept = np.flatnonzero(new & wanted[segment])
         chosen = segment[kept]
         start = self.start[chosen]
         return start + fraction[kept][:, None] * (self.end[chosen] - start), chosen
@@ -166,7 +168,8 @@ def candidates_of(points: Points, network: Network, search: SegmentSearch, reach
     pairs = tree.sparse_distance_matrix(search.tree, reach_m + PROBE_SPACING_M, output_type="ndarray")
     step = pairs["i"].astype(np.int64)
     segment = search.segment[pairs["j"]]
-    order = np.lexsort((pairs["v"], segments.element[segment], step))
+    # Step and element in one number, which sorts faster than both.
+    order = np.lexsort((pairs["v"], step * network.count + segments.element[segment]))
     step = step[order]
     segment = segment[order]
     element = segments.element[segment]

@@ -12,6 +12,7 @@ from pipeline.stages.odometry.driven import turns_of
 from pipeline.stages.odometry.odometry import odometry_of as odometry_of_stream
 from pipeline.stages.odometry.polarity import grows_with, polarity
 from pipeline.stages.odometry.quantisation import Noise, QuantisationNoise
+from schemas.arrays import NS_PER_S
 from schemas.config import Configuration, Vehicle
 from tests.stages.alignment.straight import odometer_of, odometry_from
 
@@ -21,6 +22,25 @@ def test_distance_is_interpolated_and_never_extrapolated():
     at = np.array([-0.1, 0.0, 0.5, 1.5, 2.0, 2.1])
     assert odometry.known_at_s(at).tolist() == [False, True, True, True, True, False]
     np.testing.assert_allclose(odometry.distance_at_s(at)[1:5], [0.0, 5.0, 15.5, 21.0])
+
+
+def test_figures_at_the_begin_of_a_step_are_looked_up_where_the_latency_changed():
+    odometry = odometry_from(odometer_of(np.arange(20.0), distance_m=np.arange(20.0) ** 2))
+    t_ns = odometry.epoch_ns + np.arange(2, 12) * NS_PER_S
+    scale = np.linspace(0.99, 1.01, 10)
+    latency_s = np.array([0.2, 0.2, 0.2, 0.3, 0.3, 0.1, 0.1, 0.1, 0.0, 0.0])
+    found = odometry.increments(t_ns, scale, latency_s)
+    now_s = odometry.seconds(t_ns) - latency_s
+    before_s = np.concatenate([now_s[:1], odometry.seconds(t_ns)[:-1] - latency_s[1:]])
+    moved_m = odometry.distance_at_s(now_s) - odometry.distance_at_s(before_s)
+    faster_mps = odometry.speed_at_s(now_s) - odometry.speed_at_s(before_s)
+    np.testing.assert_array_equal(found.distance_m, scale * moved_m)
+    np.testing.assert_array_equal(found.speed_mps, scale * faster_mps)
+    begin_m, end_m = (
+        odometry.travelled_at(odometry.epoch_ns + np.round(at_s * NS_PER_S).astype(np.int64))
+        for at_s in (before_s, now_s)
+    )
+    np.testing.assert_allclose(odometry.driven(t_ns, scale, latency_s), scale * (end_m - begin_m), atol=1e-6)
 
 
 def test_rows_scatter_by_their_step_and_by_stamps_with_the_square_of_the_speed():
