@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import polars as pl
-from schemas.monitors import MONITORS, OTHER_MONITORS
 
 from datasets.experiment.catalogue_faults import HEALTHY
 from datasets.experiment.tables import Row, share, table
+from schemas.monitors import MONITORS, OTHER_MONITORS
 
 _HEAD = (
     "| fault | position fails after | seen first by | after | way | seen in | missed at failure (95 %) | unsafe |",

@@ -5,7 +5,6 @@ from pathlib import Path
 import numpy as np
 import polars as pl
 import pytest
-from schemas.monitors import MONITORS
 
 from datasets.experiment import EXPERIMENTS
 from datasets.experiment import catalogue as module
@@ -21,6 +20,7 @@ from datasets.experiment.catalogue_faults import CatalogueFault, catalogue
 from datasets.experiment.catalogue_report import catalogue_page, faults_table, monitors_table
 from pipeline.stages.track.geodesy import point_distances_m
 from schemas.config import Configuration, MonitorConfig
+from schemas.monitors import MONITORS
 from schemas.run import RunLog, Site
 
 FAULTS = {fault.name: fault for fault in catalogue()}

@@ -8,7 +8,6 @@ from typing import Any
 
 import numpy as np
 import polars as pl
-from schemas.monitors import ALL_MONITORS, MONITORS
 
 from pipeline.stages.epochs.clock import Clock, reaction_of
 from pipeline.stages.epochs.verdicts import Verdicts
@@ -29,6 +28,7 @@ from schemas.enums import (
     Verdict,
 )
 from schemas.frozen import frozen
+from schemas.monitors import ALL_MONITORS, MONITORS
 from schemas.stages import NO_REASON
 from schemas.tables import Epochs
 from schemas.words import lost_words

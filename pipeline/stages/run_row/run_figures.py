@@ -12,7 +12,6 @@ from typing import Any
 
 import numpy as np
 import polars as pl
-from schemas.monitors import SCALES
 
 from pipeline.stages.epochs.clock import Clock, availability, outages_s, share_of_time, uptime
 from pipeline.stages.judge.failures import Failure as PositionFailure
@@ -30,6 +29,7 @@ from schemas import enums
 from schemas.arrays import NS_PER_S, Bools, Floats, Ints, median
 from schemas.config import Configuration, HazardConfig
 from schemas.enums import TRUTH, Judgement, PassageStatus, Reason, RunVerdict, ThrVerdict
+from schemas.monitors import SCALES
 
 RunRow = Mapping[str, Any]
 Failure = tuple[float, float, str]
