@@ -7,7 +7,7 @@ from typing import Annotated
 from pydantic import Field, field_validator
 
 from schemas.config_base import NonNegative, Number, Positive, Probability, Settings
-from schemas.tables import MONITORS
+from schemas.monitors import MONITORS
 
 
 def threshold_factor(false_alarm_probability: float) -> float:

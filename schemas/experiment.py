@@ -6,7 +6,7 @@ import dataframely as dy
 
 from schemas.columns import count, flag, instant, one_of, real, text, texts
 from schemas.enums import OwnError, RunStatus
-from schemas.tables import SCALES
+from schemas.monitors import SCALES
 
 
 def _with_bounds(name: str, meaning: str) -> dict[str, dy.Column]:

@@ -15,8 +15,8 @@ from pipeline.stages.evidence import TruePlaces
 from pipeline.stages.judge.judged import Judgements
 from schemas.arrays import flags, floats, ints, times_ns, truths
 from schemas.enums import Evidence, Judgement, LdsMode, LdsState, LostTo, NotEvaluated, SigmaSource
+from schemas.monitors import MONITORS
 from schemas.stages import MatchedEpochs
-from schemas.tables import MONITORS
 
 Epochs = TypeVar("Epochs", bound=MatchedEpochs)
 _WORDS: Mapping[str, type[StrEnum]] = {

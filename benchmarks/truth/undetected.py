@@ -31,8 +31,8 @@ from pipeline.studies.undetected.columns import rows_of, windows_of
 from pipeline.studies.undetected.profile import FaultProfile, profile_at
 from schemas.arrays import floats, times_ns
 from schemas.config import Configuration, Vehicle
+from schemas.monitors import MONITORS
 from schemas.run import RunLog, Site
-from schemas.tables import MONITORS
 
 RUNS = 200
 CURVED_RUNS = 50

@@ -25,8 +25,8 @@ from pipeline.results.workers import mapped
 from schemas.config import Configuration, Vehicle
 from schemas.frozen import frozen
 from schemas.inputs import BaliseReads
+from schemas.monitors import MONITORS
 from schemas.run import RunLog, RunTables, Site
-from schemas.tables import MONITORS
 
 REPETITIONS = 40
 RATE_HZ = 1.0

@@ -6,7 +6,7 @@ import polars as pl
 
 from datasets.experiment.catalogue_faults import HEALTHY
 from datasets.experiment.tables import Row, share, table
-from schemas.tables import MONITORS, OTHER_MONITORS
+from schemas.monitors import MONITORS, OTHER_MONITORS
 
 _HEAD = (
     "| fault | position fails after | seen first by | after | way | seen in | missed at failure (95 %) | unsafe |",

@@ -34,7 +34,7 @@ from schemas.config import Configuration, threshold_factor
 from schemas.enums import MonitorState, RunStatus
 from schemas.errors import UsageError
 from schemas.frozen import frozen
-from schemas.tables import SCALES
+from schemas.monitors import SCALES
 
 REPETITIONS = 20_000
 TARGETS: tuple[float, ...] = (1e-4, 1e-9)

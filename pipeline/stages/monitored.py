@@ -25,8 +25,8 @@ from pipeline.stages.prepare import PreparedRun
 from schemas.arrays import times_ns
 from schemas.enums import NotEvaluated
 from schemas.frozen import frozen
+from schemas.monitors import ALL_MONITORS
 from schemas.stages import AlignedEpochs
-from schemas.tables import ALL_MONITORS
 
 _AGAINST_ODOMETER = tuple(monitor.name for monitor in ALL_MONITORS if monitor.against_odometer)
 

@@ -177,7 +177,7 @@ def test_hanging_worker_is_given_up(
     """Also one that cannot end itself, since the whole process stands still."""
     endless(tmp_path / "hanging.mcap")
     seen: list[int] = []
-    clock = Hurried(monkeypatch, "loop")
+    clock = Hurried(monkeypatch, "run")
 
     def stop(run_id: str, age_s: float) -> None:
         if run_id == "hanging" and age_s > _BEGUN_S and not seen:

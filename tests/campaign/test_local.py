@@ -17,8 +17,9 @@ import pytest
 
 from datasets.mcap_log import write_mcap
 from pipeline import storage
-from pipeline.campaign import CampaignSummary, RunOutcome, ground, make_plan, recorded_log, run_campaign
+from pipeline.campaign import CampaignSummary, RunOutcome, make_plan, recorded_log, run_campaign
 from pipeline.campaign.outcome import lost, never_begun
+from pipeline.campaign.plan import _kept_sites
 from pipeline.campaign.waits import WAITS
 from pipeline.read.ingest import read_run
 from pipeline.results import store
@@ -267,7 +268,7 @@ def test_a_worker_that_dies_or_stays_while_it_starts_costs_no_attempt(
     plan = plan_of(small_trial, tmp_path)
     monkeypatch.setattr(SpawnProcess, "start", start)
     large = Site(pl.DataFrame({"x": range(10**5)}), pl.DataFrame(), None)
-    monkeypatch.setattr(ground, "_kept_sites", {**ground._kept_sites, ("other", SiteConfig()): large})
+    monkeypatch.setattr("pipeline.campaign.plan._kept_sites", {**_kept_sites, ("other", SiteConfig()): large})
     if signum == signal.SIGSTOP:
         monkeypatch.setattr(WAITS, "start_s", 8.0)
     summary = run_campaign(plan, jobs=2)
@@ -315,7 +316,7 @@ def test_run_whose_worker_always_dies_is_reported(small_trial: SmallTrial, tmp_p
 @pytest.mark.usefixtures("forked_workers")
 def test_hanging_run_is_given_up(small_trial: SmallTrial, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     endless(tmp_path / "hanging.mcap")
-    clock = Hurried(monkeypatch, "loop")
+    clock = Hurried(monkeypatch, "run")
 
     def hurry(run_id: str, age_s: float) -> None:
         if run_id == "hanging" and age_s > 0.0 and len(spy.seen) == 2:

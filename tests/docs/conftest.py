@@ -17,7 +17,7 @@ from pipeline.campaign.run import write_campaign
 from pipeline.campaign.worker import replay_one
 from pipeline.results.store import write_config
 from schemas.config import Configuration, to_toml
-from schemas.tables import BANK_MONITORS
+from schemas.monitors import BANK_MONITORS
 from tests.conftest import Shared
 from tests.docs.blocks import ROOT
 

@@ -11,7 +11,7 @@ import pytest
 
 from tests.docs.blocks import ROOT
 
-SINGLE, TABLES = "pipeline/stages/monitors/single.py", "schemas/tables.py"
+SINGLE, MONITORS, TABLES = "pipeline/stages/monitors/single.py", "schemas/monitors.py", "schemas/tables.py"
 FIGURES = "pipeline/stages/run_row/run_figures.py"
 INPUTS, RUN, CONFIG = "schemas/inputs.py", "schemas/run.py", "schemas/config_ingest.py"
 ENUMS, WORDS, LIMITS = "schemas/enums.py", "schemas/words.toml", "schemas/config_judge.py"
@@ -27,7 +27,7 @@ MONITOR = [
         "    return verdicts(epochs.cross_track_m, factor * epochs.sigma_cross_m, reasons)\n\n\n",
     ),
     (SINGLE, '    "channel": lambda', '    "offside": lambda seen: offside_monitor(seen.epochs, 5.3),\n'),
-    (TABLES, '    Monitor("channel"', '    Monitor("offside", "m", "other", "off side", axis="cross"),\n'),
+    (MONITORS, '    Monitor("channel"', '    Monitor("offside", "m", "other", "off side", axis="cross"),\n'),
 ]
 COLUMN = [
     (TABLES, "    part_verdict = one_of(", '    epochs_on_track = count("epochs on the track")\n'),
@@ -167,7 +167,7 @@ from schemas.config import Configuration, settings_from
 from mcap.writer import Writer
 from schemas.dictionary import dictionary_markdown
 from schemas.settings_page import settings_markdown
-from schemas.tables import MONITORS
+from schemas.monitors import MONITORS
 from schemas.words import JUDGES, reason_words
 import numpy as np
 

@@ -20,8 +20,8 @@ from datasets.experiment.catalogue_faults import CatalogueFault, catalogue
 from datasets.experiment.catalogue_report import catalogue_page, faults_table, monitors_table
 from pipeline.stages.track.geodesy import distances_m
 from schemas.config import Configuration, MonitorConfig
+from schemas.monitors import MONITORS
 from schemas.run import RunLog, Site
-from schemas.tables import MONITORS
 
 FAULTS = {fault.name: fault for fault in catalogue()}
 

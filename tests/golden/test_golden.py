@@ -27,8 +27,9 @@ from pipeline.show.report import write_report
 from schemas.config import Configuration, Vehicle
 from schemas.enums import BaliseKind, Hazard, NotEvaluated, PassageStatus
 from schemas.inputs import BaliseReads
+from schemas.monitors import BANK_MONITORS, MONITORS
 from schemas.run import RunLog, RunTables
-from schemas.tables import BANK_MONITORS, MONITORS, TABLES
+from schemas.tables import TABLES
 
 HERE = Path(__file__).parent
 EXPECTED = HERE / "expected"

@@ -12,8 +12,8 @@ from pipeline.stages.track.geodesy import SEMI_MAJOR_AXIS_M
 from schemas.arrays import floats, times_ns
 from schemas.config import Vehicle
 from schemas.enums import NotEvaluated, Origin
+from schemas.monitors import BANK_MONITORS
 from schemas.run import RunLog, RunTables
-from schemas.tables import BANK_MONITORS
 from schemas.words import verdict_figures_words
 from tests.replay.journeys import VEHICLE, journey, replay
 

@@ -14,7 +14,8 @@ from schemas.conform import conform
 from schemas.dictionary import dictionary_frame, dictionary_markdown
 from schemas.errors import BaliseError, ConfigError, InputError
 from schemas.inputs import SITE_SCHEMAS, STREAM_SCHEMAS
-from schemas.tables import MONITORS, OTHER_MONITORS, TABLES, Alarms, Epochs
+from schemas.monitors import MONITORS, OTHER_MONITORS
+from schemas.tables import TABLES, Alarms, Epochs
 
 ROOT = Path(__file__).parents[2]
 

@@ -24,8 +24,8 @@ from pipeline.studies.plausibility.fit import clock_advice
 from schemas.arrays import NS_PER_S, Bools, Floats, Ints, flags, floats, ints, runs_of
 from schemas.errors import InputError
 from schemas.frozen import frozen
+from schemas.monitors import MONITORS, SCALES
 from schemas.run import RunLog
-from schemas.tables import MONITORS, SCALES
 
 # Epochs before the onset that the time in use is reckoned from: a negation in force there has no part in it.
 _LEAD_S = 30.0

@@ -19,8 +19,8 @@ from pipeline.show.export.position_messages import location_fix_topic, navsatfix
 from pipeline.show.export.positions import as_gnss, positions_of
 from pipeline.storage import whole_file
 from pipeline.storage.described import PREFIX
+from schemas.monitors import MONITORS
 from schemas.run import RunLog, RunTables, Site
-from schemas.tables import MONITORS
 
 PositionMessage = Literal["foxglove", "ros"]
 Compression = Literal["zstd", "lz4", "none"]

@@ -13,8 +13,8 @@ from pipeline.show.export.mcap_file import PositionMessage, run_topics, write_to
 from pipeline.stages.prepare import input_digest
 from pipeline.storage import write_bytes
 from schemas.errors import UsageError
+from schemas.monitors import AXES, OTHER_MONITORS, SCALES
 from schemas.run import RunLog, RunTables, Site
-from schemas.tables import AXES, OTHER_MONITORS, SCALES
 
 SUFFIXES = (".mcap", ".geojson", ".gpx", ".gpkg", ".parquet")
 

@@ -12,7 +12,7 @@ from pipeline.show.report.markup import Json, packed
 from pipeline.stages.epochs.clock import gap_limit_s, nominal_period_s
 from schemas.arrays import Bools, Floats, Ints, floats
 from schemas.enums import Judgement, LdsMode, LdsState, MonitorState
-from schemas.tables import ALL_MONITORS, MONITORS
+from schemas.monitors import ALL_MONITORS, MONITORS
 
 SERIES = (
     "speed_mps",

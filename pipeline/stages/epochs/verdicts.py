@@ -14,8 +14,8 @@ from schemas.arrays import NS_PER_S, Bools, Floats, Ints, Rows, floats, ints
 from schemas.config import LdsConfig
 from schemas.enums import MonitorState, NotEvaluated
 from schemas.frozen import frozen
+from schemas.monitors import MONITORS
 from schemas.stages import NO_REASON, REASONS, AlignedEpochs, LdsEpochs, reason_words
-from schemas.tables import MONITORS
 
 # Reasons that several monitors give.
 DISABLED = NotEvaluated.DISABLED

@@ -18,8 +18,9 @@ from schemas.config import Configuration, HazardConfig
 from schemas.conform import dtypes, table_of_rows
 from schemas.enums import Suspect, Verdict
 from schemas.frozen import frozen
+from schemas.monitors import ALL_MONITORS
 from schemas.stages import MatchedEpochs
-from schemas.tables import ALL_MONITORS, Alarms
+from schemas.tables import Alarms
 
 _ODOMETER = "odometer"
 

@@ -27,8 +27,8 @@ from pipeline.stages.monitors.noise import OF_WALK, OF_WHITE_NOISE, NoiseMeter
 from schemas.arrays import Bools, Floats, Ints
 from schemas.config import Configuration
 from schemas.enums import NotEvaluated
+from schemas.monitors import SCALES
 from schemas.stages import AlignedEpochs
-from schemas.tables import SCALES
 
 FIRST_EPOCH = NotEvaluated.FIRST_EPOCH
 

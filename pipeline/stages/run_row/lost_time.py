@@ -28,8 +28,9 @@ from schemas.enums import (
     Verdict,
 )
 from schemas.frozen import frozen
+from schemas.monitors import ALL_MONITORS, MONITORS
 from schemas.stages import NO_REASON
-from schemas.tables import ALL_MONITORS, MONITORS, Epochs
+from schemas.tables import Epochs
 from schemas.words import lost_words
 
 _LOST_TO = dtypes(Epochs)["lost_to"]

@@ -26,7 +26,7 @@ from schemas import enums
 from schemas.arrays import NS_PER_S, Bools, Floats, Ints, median
 from schemas.config import Configuration, HazardConfig
 from schemas.enums import TRUTH, Judgement, PassageStatus, Reason, RunVerdict, ThrVerdict
-from schemas.tables import SCALES
+from schemas.monitors import SCALES
 
 RunRow = Mapping[str, Any]
 Failure = tuple[float, float, str]

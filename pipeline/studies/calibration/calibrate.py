@@ -31,8 +31,8 @@ from pipeline.studies.plausibility.fit import clock_advice, required_fit
 from schemas.config import Configuration, Vehicle
 from schemas.errors import InputError
 from schemas.frozen import frozen
+from schemas.monitors import AXES
 from schemas.run import RunLog, Site
-from schemas.tables import AXES
 
 _AS_STATED = {"sigma_intercept_m": 0.0, "sigma_slope": 1.0}
 _NO_NOISE = {f"noise_{axis}_m": (0.0, 0.0, 0.0, 0.0) for axis in AXES}

@@ -17,7 +17,7 @@ from schemas.arrays import Floats
 from schemas.config import CalibrationConfig, Configuration
 from schemas.enums import MonitorState
 from schemas.frozen import frozen
-from schemas.tables import ALL_MONITORS, AXES, SCALES
+from schemas.monitors import ALL_MONITORS, AXES, SCALES
 
 # Numerics of the regression: bins of the same number of epochs. Half or twice as many change a simulated fit by less
 # than a fifth of its standard error.

@@ -23,7 +23,7 @@ from schemas.arrays import NS_PER_S, Bools
 from schemas.config import Configuration
 from schemas.enums import TRUTH, Judgement, MonitorState, RunStatus, Verdict
 from schemas.frozen import frozen
-from schemas.tables import ALL_MONITORS
+from schemas.monitors import ALL_MONITORS
 
 Row = dict[str, object]
 

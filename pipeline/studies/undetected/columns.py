@@ -20,7 +20,8 @@ from schemas.config import Configuration, UndetectedConfig
 from schemas.conform import dtypes
 from schemas.enums import BaliseKind
 from schemas.frozen import frozen
-from schemas.tables import SCALES, Epochs, Passages
+from schemas.monitors import SCALES
+from schemas.tables import Epochs, Passages
 
 _OF_EPOCHS = ("undetected_{}_m", "undetected_{}_in_use_m")
 _OF_RANGE = "undetected_range_{}_m"

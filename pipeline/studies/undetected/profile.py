@@ -13,7 +13,7 @@ from pipeline.studies.undetected.steps_and_ramps import largest_of_shape
 from schemas.arrays import NS_PER_S, ints, times_ns
 from schemas.errors import UsageError
 from schemas.frozen import frozen
-from schemas.tables import SCALES
+from schemas.monitors import SCALES
 
 
 @frozen

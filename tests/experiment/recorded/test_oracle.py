@@ -19,8 +19,8 @@ from datasets.trial import build_run, build_site
 from pipeline import replay
 from schemas.arrays import NS_PER_S, times_ns
 from schemas.config import Configuration
+from schemas.monitors import BANK_MONITORS
 from schemas.run import RunTables
-from schemas.tables import BANK_MONITORS
 from tests.experiment.recorded.conftest import Journey
 
 ROOT = Path(__file__).parents[3]

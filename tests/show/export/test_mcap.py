@@ -14,7 +14,7 @@ from mcap_protobuf.decoder import DecoderFactory
 
 from pipeline.show.export import export_run
 from schemas.errors import UsageError
-from schemas.tables import MONITORS
+from schemas.monitors import MONITORS
 from tests.show.export.conftest import Result
 
 

@@ -24,8 +24,8 @@ from pipeline.show.report.campaign_page import RUN_COLUMNS
 from pipeline.show.report.route_found import found_route
 from schemas.campaign import STANFORD
 from schemas.errors import UsageError
+from schemas.monitors import MONITORS
 from schemas.run import RunTables, Site
-from schemas.tables import MONITORS
 from tests.show.report.conftest import FAILED, REASON, RUNS
 
 

@@ -14,8 +14,8 @@ from pipeline.stages.monitors.axes import NO_HEIGHT, OFF_TRACK
 from pipeline.stages.monitors.bank import FIRST_EPOCH, MonitorBank
 from pipeline.stages.monitors.single import NO_VELOCITY, channel_monitor, doppler_monitor, paired
 from schemas.config import Configuration, Vehicle, threshold_factor
+from schemas.monitors import BANK_MONITORS
 from schemas.stages import AlignedEpochs
-from schemas.tables import BANK_MONITORS
 from tests.arrays_of_table import arrays_of_table
 from tests.frames import bank_over, verdict_table
 from tests.stages.alignment.straight import NO_NOISE, Straight, align_run, epochs_of, odometer_of, run

@@ -18,8 +18,9 @@ from pipeline.stages.run_row.lost_time import lost_columns
 from pipeline.stages.run_row.summary import SolutionResults, failed_row, summarise
 from schemas.config import Configuration, LdsConfig
 from schemas.enums import Evidence, Note, VehicleFigures
+from schemas.monitors import SCALES
 from schemas.run import IngestNotes
-from schemas.tables import CONTRACT_VERSION, SCALES, Runs
+from schemas.tables import CONTRACT_VERSION, Runs
 from schemas.words import Remark
 from tests.arrays_of_table import arrays_of_table
 from tests.tables import NS, alarms, epochs, failures, hazards, passages
