@@ -25,6 +25,7 @@ from schemas.config_ingest import (
     PlausibilityConfig,
     StreamCorrection,
     StreamMapping,
+    StreamMappings,
     WrapsConfig,
 )
 from schemas.config_judge import EvidenceConfig, HazardConfig, LdsConfig, UndetectedConfig
@@ -162,6 +163,7 @@ __all__ = [
     "SiteConfig",
     "StreamCorrection",
     "StreamMapping",
+    "StreamMappings",
     "SurveyConfig",
     "UndetectedConfig",
     "Vehicle",

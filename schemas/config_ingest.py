@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Annotated, Literal
+from typing import Annotated, Generic, Literal, TypeVar
 
 from pydantic import Field, model_validator
 
 from schemas.config_base import NonNegative, Number, Positive, Probability, Settings
 from schemas.enums import Fix, Origin
+from schemas.run import RecordedStream
 
 
 class StreamMapping(Settings):
@@ -58,6 +59,39 @@ class StreamMapping(Settings):
     """Name of the solution."""
 
 
+Mapped = TypeVar("Mapped", bound=StreamMapping)
+
+
+class StreamMappings(Settings, Generic[Mapped]):
+    """Mappings of what was recorded, by the stream that they make."""
+
+    gnss: tuple[Mapped, ...] = ()
+    """Mappings of topics that hold GNSS positions.
+
+    Schema names that are known need none (CONTRACT section 1).
+    """
+    odometer: tuple[Mapped, ...] = ()
+    """Mappings of topics that hold odometer distance or speed.
+
+    As for `ingest.gnss`.
+    """
+    satellites: tuple[Mapped, ...] = ()
+    """Mappings of topics that hold range residuals.
+
+    As for `ingest.gnss`.
+    """
+    reference: tuple[Mapped, ...] = ()
+    """Mappings of topics that hold true positions.
+
+    As for `ingest.gnss`.
+    """
+    balise_reads: tuple[Mapped, ...] = ()
+    """Mappings of topics that hold reads of physical balises.
+
+    As for `ingest.gnss`.
+    """
+
+
 class WrapsConfig(Settings):
     """When a fall of a counter is the end of its bits or digits, and no reset."""
 
@@ -100,8 +134,8 @@ class StreamCorrection(Settings):
     `shift_s` is added to the times and `shift_*_m` to the positions. `solution`: of GNSS and satellites only this one.
     """
 
-    stream: Literal["gnss", "odometer", "satellites", "reference", "balise_reads"]
-    """`gnss`, `odometer`, `satellites`, `reference` or `balise_reads`."""
+    stream: RecordedStream
+    """The stream: any of CONTRACT section 1 but `faults`."""
     solution: str | None = None
     """Of GNSS and satellites only this solution."""
     exchange: tuple[str, str] | None = None
@@ -131,34 +165,9 @@ class StreamCorrection(Settings):
         return ", ".join(f"{name} {value}" for name, value in changed.items())
 
 
-class IngestConfig(Settings):
+class IngestConfig(StreamMappings[StreamMapping]):
     """Which topics feed which stream (empty: recognised by schema name), and limits of plausible values."""
 
-    gnss: tuple[StreamMapping, ...] = ()
-    """Mappings of topics that hold GNSS positions.
-
-    Schema names that are known need none (CONTRACT section 1).
-    """
-    odometer: tuple[StreamMapping, ...] = ()
-    """Mappings of topics that hold odometer distance or speed.
-
-    As for `ingest.gnss`.
-    """
-    satellites: tuple[StreamMapping, ...] = ()
-    """Mappings of topics that hold range residuals.
-
-    As for `ingest.gnss`.
-    """
-    reference: tuple[StreamMapping, ...] = ()
-    """Mappings of topics that hold true positions.
-
-    As for `ingest.gnss`.
-    """
-    balise_reads: tuple[StreamMapping, ...] = ()
-    """Mappings of topics that hold reads of physical balises.
-
-    As for `ingest.gnss`.
-    """
     chunk_limit_mib: Positive = 128.0
     """Largest record that is read from an MCAP log [MiB]; a larger one counts as damage.
 

@@ -20,12 +20,14 @@ from schemas.config import (
     Settings,
     StreamCorrection,
     StreamMapping,
+    StreamMappings,
     load_settings,
     read_toml,
     settings_from,
 )
 from schemas.enums import TravelAlong
 from schemas.errors import ConfigError
+from schemas.run import RECORDED_STREAMS
 
 FILE_NAME = "balise.toml"
 NO_VEHICLE = "none"
@@ -63,18 +65,13 @@ class LogMapping(StreamMapping):
     topic: str = ""
 
 
-class LogEntry(Settings):
+class LogEntry(StreamMappings[LogMapping]):
     """Logs of one recorder: `files` follow each other in time. `stream`: what their positions are for."""
 
     files: Annotated[tuple[PathText, ...], Field(min_length=1)]
     stream: Literal["gnss", "reference"] = "gnss"
     solution: str | None = None
     date: day | None = None
-    gnss: tuple[LogMapping, ...] = ()
-    odometer: tuple[LogMapping, ...] = ()
-    satellites: tuple[LogMapping, ...] = ()
-    reference: tuple[LogMapping, ...] = ()
-    balise_reads: tuple[LogMapping, ...] = ()
 
     def mappings(self) -> dict[str, tuple[StreamMapping, ...]]:
         """Mappings by stream, each with the topic that it is for: of tables the name of the file."""
@@ -85,7 +82,7 @@ class LogEntry(Settings):
                 for given in getattr(self, stream)
                 for topic in ([given.topic] if given.topic else names)
             )
-            for stream in ("gnss", "odometer", "satellites", "reference", "balise_reads")
+            for stream in RECORDED_STREAMS
             if getattr(self, stream)
         }
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import field, replace
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, Literal, get_args
 
 from schemas.frozen import frozen
 
@@ -13,15 +13,11 @@ if TYPE_CHECKING:
 
     from schemas.config import StreamCorrection
 
-Stream = Literal["gnss", "odometer", "satellites", "reference", "balise_reads", "faults"]
-STREAMS: tuple[Stream, ...] = (
-    "gnss",
-    "odometer",
-    "satellites",
-    "reference",
-    "balise_reads",
-    "faults",
-)
+RecordedStream = Literal["gnss", "odometer", "satellites", "reference", "balise_reads"]
+Stream = Literal[RecordedStream, "faults"]
+"""The recorded streams, and what was injected into them."""
+RECORDED_STREAMS: tuple[RecordedStream, ...] = get_args(RecordedStream)
+STREAMS: tuple[Stream, ...] = get_args(Stream)
 
 
 @frozen

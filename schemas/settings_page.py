@@ -12,6 +12,7 @@ from pydantic import BaseModel
 from pydantic.fields import FieldInfo
 
 from schemas.config import Configuration, StreamCorrection, StreamMapping, Vehicle
+from schemas.config_base import Settings
 from schemas.frozen import frozen
 
 _INTRODUCTION = """# Configuration and vehicle file
@@ -85,8 +86,18 @@ def field_texts(model: type[BaseModel]) -> dict[str, tuple[str, str]]:
         model: a model of settings.
 
     Returns:
-        (meaning, reason) by field.
+        (meaning, reason) by field, those that it inherits too.
     """
+    texts: dict[str, tuple[str, str]] = {}
+    for base in reversed(model.__mro__):
+        # A generic model with its parameters filled in has no source: its origin is a base as well.
+        if issubclass(base, Settings) and not base.__pydantic_generic_metadata__["args"]:
+            texts |= _texts_in(base)
+    return texts
+
+
+def _texts_in(model: type[BaseModel]) -> dict[str, tuple[str, str]]:
+    """Meaning and reason of each field that the body of a model declares."""
     body = ast.parse(textwrap.dedent(inspect.getsource(model))).body[0]
     assert isinstance(body, ast.ClassDef)
     texts: dict[str, tuple[str, str]] = {}

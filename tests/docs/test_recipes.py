@@ -44,13 +44,12 @@ STREAM = [
         'class Doors(dy.Schema):\n    t = instant("time of validity")\n    open = flag("a door is open")\n\n\n',
     ),
     (INPUTS, '    "faults": Faults,', '    "doors": Doors,\n'),
-    (RUN, '"faults"]', '"doors", '),
-    (RUN, '    "faults",\n', '    "doors",\n'),
+    (RUN, '"balise_reads"]', '"doors", '),
     (RUN, "    faults: pl.DataFrame", "    doors: pl.DataFrame | None = None\n"),
     (
         CONFIG,
-        "    balise_reads: tuple[StreamMapping",
-        "    doors: tuple[StreamMapping, ...] = ()\n"
+        "    balise_reads: tuple[Mapped",
+        "    doors: tuple[Mapped, ...] = ()\n"
         '    """Topics that hold door states.\n\n    As for `ingest.gnss`.\n    """\n',
     ),
 ]
@@ -105,13 +104,12 @@ DETECTIONS = [
         '    measure_m = real("m", "its place", nullable=False)\n\n\n',
     ),
     (INPUTS, '    "faults": Faults,', '    "detections": Detections,\n'),
-    (RUN, '"faults"]', '"detections", '),
-    (RUN, '    "faults",\n', '    "detections",\n'),
+    (RUN, '"balise_reads"]', '"detections", '),
     (RUN, "    faults: pl.DataFrame", "    detections: pl.DataFrame | None = None\n"),
     (
         CONFIG,
-        "    balise_reads: tuple[StreamMapping",
-        "    detections: tuple[StreamMapping, ...] = ()\n"
+        "    balise_reads: tuple[Mapped",
+        "    detections: tuple[Mapped, ...] = ()\n"
         '    """Topics that hold passages at trackside detectors.\n\n    As for `ingest.gnss`.\n    """\n',
     ),
 ]
@@ -163,11 +161,13 @@ from pipeline import read_run, replay
 from pipeline.show.report.series import monitor_lines, time_data
 from pipeline.results.figures.campaign_tables import campaign_levels
 from pipeline.results.store import write_run
+from pipeline.studies.plausibility.fit import _in_order
 from schemas.config import Configuration, settings_from
 from mcap.writer import Writer
 from schemas.dictionary import dictionary_markdown
 from schemas.settings_page import settings_markdown
 from schemas.monitors import MONITORS
+from schemas.project import LogEntry
 from schemas.words import JUDGES, reason_words
 import numpy as np
 
@@ -203,6 +203,9 @@ page = time_data(tables.epochs, np.array([], dtype=np.int64), 1.0)
 folder = Path(sys.argv[2]); folder.mkdir()
 run.gnss.write_parquet(folder / "gnss.parquet")
 pl.DataFrame({"t": run.gnss["t"][:2], "open": [False, True]}).write_parquet(folder / "doors.parquet")
+doors = read_run(folder).doors
+corrected = Configuration.model_validate({"ingest": {"correct": [{"stream": "doors", "shift_s": 3600}]}})
+entry = LogEntry.model_validate({"files": ["doors.csv"], "doors": [{"fields": {"open": "state"}}]})
 log = folder.parent / "acme.mcap"
 with log.open("wb") as stream:
     writer = Writer(stream)
@@ -229,6 +232,10 @@ print(json.dumps({
     "column": tables.runs["epochs_on_track"].to_list(),
     "acme": read_run(log).gnss.select("latitude_deg", pl.col("fix").cast(pl.String)).rows(),
     "doors": read_run(folder).doors["open"].to_list(),
+    "corrected": read_run(folder, corrected.ingest).doors["t"].dt.epoch("s").to_list(),
+    "an_hour_later": (doors["t"].dt.epoch("s") + 3600).to_list(),
+    "in_project": [topic for made in entry.mappings().values() for topic in (made[0].topic, made[0].fields)],
+    "sorted": _in_order(read_run(folder).with_streams(doors=doors[::-1])).doors.equals(doors),
     "documented": [name for name in ("offside_value", "epochs_on_track", "doors") if name in text],
     "disabled": Configuration.model_validate({"monitors": {"disabled": ["offside"]}}).monitors.disabled,
 }))
@@ -282,7 +289,11 @@ def test_a_column_takes_two_files(followed: dict[str, object]) -> None:
 
 
 def test_a_stream_takes_three_files(followed: dict[str, object]) -> None:
+    """A log's topics are mapped to it, in a project too; it is corrected, and sorted where `clean` refuses its run."""
     assert followed["doors"] == [False, True]
+    assert followed["corrected"] == followed["an_hour_later"]
+    assert followed["in_project"] == ["doors.csv", {"open": "state"}]
+    assert followed["sorted"] is True
     assert followed["key"] is True
     assert len({file for file, _, _ in STREAM}) == 3
 

@@ -3,18 +3,21 @@
 from __future__ import annotations
 
 import pickle
+from dataclasses import fields
 from pathlib import Path
 
 import polars as pl
 import pytest
 
 from pipeline.stages.monitors.single import WITHOUT_MEMORY
-from schemas.config import Configuration, Vehicle, digest_of, load_settings, settings_from, to_toml
+from schemas.config import Configuration, IngestConfig, Vehicle, digest_of, load_settings, settings_from, to_toml
 from schemas.conform import conform
 from schemas.dictionary import dictionary_frame, dictionary_markdown
 from schemas.errors import BaliseError, ConfigError, InputError
 from schemas.inputs import SITE_SCHEMAS, STREAM_SCHEMAS
 from schemas.monitors import MONITORS, OTHER_MONITORS
+from schemas.project import LogEntry
+from schemas.run import RECORDED_STREAMS, STREAMS, RunLog
 from schemas.tables import TABLES, Alarms, Epochs
 
 ROOT = Path(__file__).parents[2]
@@ -169,3 +172,10 @@ def test_a_table_with_nan_or_a_forbidden_null_is_a_defect():
         conform(good.with_columns(peak_ratio=float("nan")), Alarms)
     with pytest.raises(ValueError, match="verdict holds null"):
         conform(good.with_columns(verdict=pl.lit(None)), Alarms)
+
+
+def test_every_stream_has_its_columns_its_frame_and_its_key() -> None:
+    assert tuple(STREAM_SCHEMAS) == STREAMS == (*RECORDED_STREAMS, "faults")
+    assert [field.name for field in fields(RunLog) if field.name in STREAMS] == list(STREAMS)
+    for model in (IngestConfig, LogEntry):
+        assert [name for name in model.model_fields if name in STREAMS] == list(RECORDED_STREAMS)

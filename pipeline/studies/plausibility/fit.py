@@ -39,7 +39,7 @@ from schemas.config import Configuration, PlausibilityConfig, Vehicle
 from schemas.enums import MisfitCause, Note
 from schemas.errors import InputError
 from schemas.frozen import frozen
-from schemas.run import RunLog, Site, Stream
+from schemas.run import RECORDED_STREAMS, RunLog, Site
 from schemas.words import Remark, say
 
 
@@ -264,8 +264,8 @@ def fit_report(
 
 def _in_order(run: RunLog) -> RunLog:
     """The run with its streams sorted by time, for a run that `clean` refuses."""
-    streams: tuple[Stream, ...] = ("gnss", "odometer", "reference", "balise_reads")
-    return run.with_streams(**{name: frame.sort("t") for name in streams if (frame := run.stream(name)) is not None})
+    streams = {name: frame.sort("t") for name in RECORDED_STREAMS if (frame := run.stream(name)) is not None}
+    return run.with_streams(**streams)
 
 
 def _table_of_checks(fits: dict[str, Fit], counts: CleanCounts) -> pl.DataFrame:
