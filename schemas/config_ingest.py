@@ -266,7 +266,7 @@ class PlausibilityConfig(Settings):
 
     Worn wheels 4 %, bad radars 6 %; the nearest wrong unit (yards) 9 %. Ours.
     """
-    scale_told: Probability = 0.03
+    reported_scale: Probability = 0.03
     """A scale that differs from 1 by more is reported.
 
     Wrong wheel diameters are larger; 0.8 % was seen in recorded runs. Ours.
@@ -276,12 +276,12 @@ class PlausibilityConfig(Settings):
 
     Receivers and buses are late by 2 s at most; the nearest wrong clock (leap seconds) is 18 s off. Ours.
     """
-    lag_told_s: Positive = 0.3
+    reported_lag_s: Positive = 0.3
     """A larger lag is reported [s].
 
     At 40 m/s it is more than half the failure limit of 20 m. Ours.
     """
-    shift_told_m: Positive = 8.0
+    reported_shift_m: Positive = 8.0
     """A larger constant shift of survey or reference is reported [m].
 
     Positions without corrections are within 5 m of the track, 95 %. Ours.

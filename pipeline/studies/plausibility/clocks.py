@@ -137,9 +137,9 @@ def _check(of: Recording, lag: StreamLag, of_gnss: StreamLag | None, known: bool
     size_s = abs(lag.lag_s)
     if lag.reason:
         return not_checked(what, lag.reason)
-    if not lag.sure and size_s > max(config.lag_told_s, SIGNIFICANT_SIGMAS * lag.sigma_s):
+    if not lag.sure and size_s > max(config.reported_lag_s, SIGNIFICANT_SIGMAS * lag.sigma_s):
         return not_checked(what, f"{lag.lag_s:+.2f} s, but not in all of the run: a lag, a slip or a drift")
-    if not lag.sure or size_s <= config.lag_told_s:
+    if not lag.sure or size_s <= config.reported_lag_s:
         return fits(what, f"{lag.lag_s:+.2f} s")
     later = "later" if lag.lag_s > 0 else "earlier"
     found = f"{lag.lag_s:+.{1 if size_s > 5 else 2}f} s, stamps of the {lag.name} are {later}"

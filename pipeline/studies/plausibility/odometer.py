@@ -72,7 +72,7 @@ def _lag(pair: PairFit, of: Recording) -> StreamLag:
         return StreamLag("odometer", pair.lag_s, min(pair.lag_sigma_s, 1.0), sure=True)
     if pair.clock_reason or not pair.lag_known:
         return StreamLag("odometer", reason=pair.clock_reason or "the speed changes too little")
-    sure = pair.other_lag(-(of.vehicle.gnss_latency_s or 0.0), of.config.lag_told_s)
+    sure = pair.other_lag(-(of.vehicle.gnss_latency_s or 0.0), of.config.reported_lag_s)
     return StreamLag("odometer", pair.lag_s, pair.lag_sigma_s, sure)
 
 
@@ -117,7 +117,7 @@ def _scale_checks(name: str, of: Recording) -> list[Check]:
         return []
     words = f"the run shows {scale:.4f} (sigma {pair.scale_sigma:.4f})"
     if file_scale is None:
-        other = pair.other_scale(1.0, config.scale_told)
+        other = pair.other_scale(1.0, config.reported_scale)
         wheel = misfit(what, words, MisfitCause.WHEEL, lines=lines, into=VEHICLE_FILE)
         return [wheel if other else fits(what, words)]
     words = f"{file_scale:.4f}, {words}"

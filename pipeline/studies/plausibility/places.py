@@ -55,7 +55,7 @@ def copy_check(of: Recording) -> Check | None:
     if chance > of.config.copy_chance:
         return None
     if of.line is not None:
-        aside_m = fit_survey(of.gnss, of.line, of.config.shift_told_m).aside_m
+        aside_m = fit_survey(of.gnss, of.line, of.config.reported_shift_m).aside_m
         if aside_m < _WITHOUT_ERROR * float(sigma_m.min()):
             return None
     found = (
@@ -178,7 +178,7 @@ def reference_checks(of: Recording) -> tuple[StreamLag, list[Check]]:
     fit = fit_places(of.gnss, record, config)
     if fit.reason:
         return StreamLag("reference", reason=fit.reason), [not_checked(_REFERENCE, fit.reason)]
-    significant = abs(fit.lag_s) > max(config.lag_told_s, SIGNIFICANT_SIGMAS * fit.lag_sigma_s)
+    significant = abs(fit.lag_s) > max(config.reported_lag_s, SIGNIFICANT_SIGMAS * fit.lag_sigma_s)
     agrees = explains(fit.agreeing, 0.0)
     small = abs(fit.lag_s) <= config.lag_limit_s and agrees
     sure = significant and fit.lag_is_steady and (small or explains(fit.agreeing, fit.as_recorded))
@@ -187,7 +187,7 @@ def reference_checks(of: Recording) -> tuple[StreamLag, list[Check]]:
         return lag, [not_checked(_REFERENCE, "no one lag or shift explains them; the positions may be wrong")]
     words = f"{in_words(fit.shift_m)} of them"
     checks = [fits(_REFERENCE, words)]
-    if np.hypot(*fit.shift_m) > config.shift_told_m and fit.shift_is_steady:
+    if np.hypot(*fit.shift_m) > config.reported_shift_m and fit.shift_is_steady:
         # No lines: the judge believes the reference, and nobody should shift it to where the positions want it.
         advice = "Find out which of the two is off."
         checks = [misfit(_REFERENCE, words, MisfitCause.OFFSET_OF_REFERENCE, advice=advice)]
@@ -247,7 +247,7 @@ def survey_checks(of: Recording, line: SurveyLine) -> list[Check]:
 
     No lines: a drift of the whole run looks like a shift of the map, and nobody should move positions onto the track.
     """
-    limit_m = of.config.shift_told_m
+    limit_m = of.config.reported_shift_m
     fit = fit_survey(of.gnss, line, 1.5 * limit_m)
     heights = _height_checks("survey", fit.up_m + of.vehicle.antenna_height_m, of)
     if fit.constant and np.hypot(*fit.shift_m) > limit_m and fit.aside_m > 0.4 * limit_m:
@@ -267,7 +267,7 @@ def _height_checks(base: str, up_m: Floats, of: Recording) -> list[Check]:
         return []
     words = f"the {base} lies {apart_m:.0f} m above them"
     is_steady = steady(*(np.array([usual(up_m[part])]) for part in (slice(None), *halves_of(len(up_m)))))
-    if abs(apart_m) <= 1.5 * of.config.shift_told_m or not is_steady:
+    if abs(apart_m) <= 1.5 * of.config.reported_shift_m or not is_steady:
         return [fits(what, words)]
     # No lines: survey or reference alone cannot show that it is right, and the other may be.
     advice = "Find out which of the two has the other zero or unit, and mend that one."

@@ -91,7 +91,7 @@ def _refined(gnss: Places, record: Places, lag_s: float, config: PlausibilityCon
     design = np.concatenate([velocity[:, :, None], np.broadcast_to(np.eye(2), (len(apart), 2, 2))], axis=2)
     fit = regressed(design, apart, floor=0.2, least_known=1e-4)
     # What is reported besides is no disagreement, nor what positions scatter beyond it.
-    bound = 1.5 * config.shift_told_m + config.lag_told_s * np.linalg.norm(velocity, axis=1)
+    bound = 1.5 * config.reported_shift_m + config.reported_lag_s * np.linalg.norm(velocity, axis=1)
     rest_s, east_m, north_m = fit.estimate.tolist()
     of_parts = (fit.estimate, *fit.halves)
     return PlaceFit(

@@ -213,7 +213,7 @@ def test_positions_are_never_moved_onto_the_survey(trips: list[Trip]) -> None:
 def test_what_is_told_is_configuration(trips: list[Trip]) -> None:
     run, moved = trips[0].run, moved_site(24.0, 18.0)(trips[0].site)
     late = shifted(10.0, "odometer")(run)
-    wide = PlausibilityConfig(shift_told_m=60.0, lag_limit_s=12.0)
+    wide = PlausibilityConfig(reported_shift_m=60.0, lag_limit_s=12.0)
     assert [check.what for check in _fit(run, moved).misfits] == ["positions against the survey"]
     assert fit_run(run, "primary", Vehicle(), wide, moved).misfits == ()
     (clock,) = _fit(late, trips[0].site).impossible

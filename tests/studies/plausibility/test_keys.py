@@ -24,10 +24,10 @@ _WRONGS = {wrong.name: wrong for wrong in WRONGS}
 # Key, another value, the recording that it decides on (a wrong of the benchmark, or a seed), other keys of both fits.
 REACH: tuple[tuple[str, float, str, dict[str, float]], ...] = (
     ("scale_limit", 0.8, "distance: yards", {}),
-    ("scale_told", 0.5, "distance: yards", {"scale_limit": 0.8}),
+    ("reported_scale", 0.5, "distance: yards", {"scale_limit": 0.8}),
     ("lag_limit_s", 12.0, "odometer 10 s later", {}),
-    ("lag_told_s", 4.0, "odometer 3 s later", {}),
-    ("shift_told_m", 0.8, "27", {}),
+    ("reported_lag_s", 4.0, "odometer 3 s later", {}),
+    ("reported_shift_m", 0.8, "27", {}),
     ("file_sigmas", 1e4, "vehicle file: 2 % more", {}),
     ("file_scale", 0.5, "vehicle file: 2 % more", {}),
     ("same_line_m", 1e-3, "27", {}),
