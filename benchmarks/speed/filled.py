@@ -30,8 +30,8 @@ def filled(log: Path, seed: int = 1) -> Path:
         messages = list(make_reader(source).iter_messages(log_time_order=False))
         odometry = [message for schema, _, message in messages if schema and schema.name == _ODOMETRY]
         seconds = np.array([message.log_time for message in odometry]) * 1e-9
-        told = np.array([np.frombuffer(message.data[-8 * _DOUBLES :])[_TWIST][0] for message in odometry])
-        tails = iter(_fields(seconds, told, np.random.default_rng(seed)))
+        speeds_mps = np.array([np.frombuffer(message.data[-8 * _DOUBLES :])[_TWIST][0] for message in odometry])
+        tails = iter(_fields(seconds, speeds_mps, np.random.default_rng(seed)))
         writer = Writer(sink, compression=CompressionType.ZSTD)
         writer.start(profile="ros2", library="benchmark")
         channels: dict[int, int] = {}

@@ -3,7 +3,7 @@
 Journeys of constant speed, shuttles, freight and trams, a counter and another recorder of them that is 0.02 to 20 s
 early or late. The drawing knows nothing of the estimator: noise of the other recorder is white and correlated over 20
 to 100 s, the counter counts in steps of nothing to 2 m, walks, has a scale, and slips; stops may last longer than all
-the rest. Of a lag that is told the truth lies within 3 sigma in 95 of 100, and within 4 in all.
+the rest. Of a lag that is reported the truth lies within 3 sigma in 95 of 100, and within 4 in all.
 """
 
 from __future__ import annotations
@@ -174,13 +174,15 @@ def figures(draws: int, seed: int) -> list[Figure]:
     for family in (*FAMILIES, ""):
         own = [row for row in rows if not family or row[0] == family]
         offs, sigma_s, scale = (np.array([row[k] for row in own]) for k in (1, 2, 3))
-        told = np.isfinite(offs)
+        shows_lag = np.isfinite(offs)
         about = f"{family or 'all'}, {len(own)} draws: "
         out += [
-            Figure(f"{about}share with a lag measured", float(told.mean()), ""),
-            Figure(f"{about}median sigma of these", float(np.median(sigma_s[told])) if told.any() else 0.0, "s"),
-            Figure(f"{about}share of these within 3 sigma", float((offs[told] <= 3.0).mean()), "", 0.95, "above"),
-            Figure(f"{about}lags wrong by more than 4 sigma", float((offs[told] > 4.0).sum()), "", 0.0),
+            Figure(f"{about}share with a lag measured", float(shows_lag.mean()), ""),
+            Figure(
+                f"{about}median sigma of these", float(np.median(sigma_s[shows_lag])) if shows_lag.any() else 0.0, "s"
+            ),
+            Figure(f"{about}share of these within 3 sigma", float((offs[shows_lag] <= 3.0).mean()), "", 0.95, "above"),
+            Figure(f"{about}lags wrong by more than 4 sigma", float((offs[shows_lag] > 4.0).sum()), "", 0.0),
             Figure(f"{about}scales wrong by more than 4 sigma", float((scale > 4.0).sum()), "", 0.0),
         ]
     return out

@@ -1,4 +1,4 @@
-"""The fit of a run: wrong units, clocks, axes and shifts that must be told, and faulty runs that must not fail.
+"""The fit of a run: wrong units, clocks, axes and shifts that must be reported, and faulty runs that must not fail.
 
 python -m benchmarks.truth.plausibility --trips 12 --runs 1000
 """
@@ -51,19 +51,19 @@ def _has(need: str, drawn: Trip) -> bool:
     return frame is not None and frame.height > 4 and frame[column].null_count() < frame.height
 
 
-def told(wrong: Wrong, drawn: Trip) -> tuple[bool, list[str]]:
-    """Whether the wrong was told as it should be, and what was said."""
+def is_reported(wrong: Wrong, drawn: Trip) -> tuple[bool, list[str]]:
+    """Whether the mistake is reported as it should be, and what was said."""
     site = wrong.site(drawn.site) if wrong.site else drawn.site
     vehicle = wrong.vehicle(drawn.scale, drawn.latency_s) if wrong.vehicle else None
     found = fit_of(wrong.change(drawn.run), site, vehicle)
     if isinstance(found, str):
-        return all(word in found for word in wrong.told), [found]
+        return all(word in found for word in wrong.reported), [found]
     checks = found.impossible if wrong.fails else found.misfits
     return any(_says(check, wrong) for check in checks), [check.sentence for check in found.misfits]
 
 
 def _says(check: Check, wrong: Wrong) -> bool:
-    return all(word in check.sentence for word in wrong.told)
+    return all(word in check.sentence for word in wrong.reported)
 
 
 def faulty(count: int, first: int = 0) -> Iterator[tuple[int, Trip, Fit | str, float]]:
@@ -80,16 +80,16 @@ def measure(_: Path) -> list[Figure]:
     tried, found = 0, 0
     for wrong in WRONGS:
         for drawn in [drawn for seed in range(8) if applies(wrong, drawn := trip(seed, place=wrong.place))][:3]:
-            tried, found = tried + 1, found + told(wrong, drawn)[0]
+            tried, found = tried + 1, found + is_reported(wrong, drawn)[0]
     refused = sum(isinstance(fit, str) or bool(fit.impossible) for _, _, fit, _ in faulty(100))
     return [
-        Figure("wrong recordings told with their cause", found / tried, "1", target=0.97, better="above"),
+        Figure("wrong recordings reported with their cause", found / tried, "1", target=0.97, better="above"),
         Figure("faulty but plausible runs that fail, of 100", float(refused), "1", target=0.0),
     ]
 
 
 def main() -> int:
-    """Print what was not told, and each plausible run that fails; exit status 1 if there is one."""
+    """Print what was not reported, and each plausible run that fails; exit status 1 if there is one."""
     parser = argparse.ArgumentParser(prog="benchmarks.truth.plausibility", description=__doc__)
     parser.add_argument("--trips", type=int, default=12, help="of each wrong")
     parser.add_argument("--runs", type=int, default=1000, help="faulty but plausible ones")
@@ -100,15 +100,15 @@ def main() -> int:
     for wrong in WRONGS:
         chosen = [one for one in drawn if applies(wrong, one)][: given.trips]
         chosen = chosen if wrong.place is None else [trip(seed, place=wrong.place) for seed in range(given.trips)]
-        results = [(one.run.run_id, *told(wrong, one)) for one in chosen]
+        results = [(one.run.run_id, *is_reported(wrong, one)) for one in chosen]
         good = sum(result[1] for result in results)
         missed, tried = missed + len(results) - good, tried + len(results)
         if good < len(results) or given.verbose:
-            print(f"{wrong.name}: told {good} of {len(results)}", flush=True)
+            print(f"{wrong.name}: reported {good} of {len(results)}", flush=True)
             for run_id, right, said in results:
                 if not right:
                     print(f"    {run_id}: {'; '.join(said)}", flush=True)
-    print(f"{len(WRONGS)} wrongs, {tried} recordings, {missed} not told", flush=True)
+    print(f"{len(WRONGS)} wrongs, {tried} recordings, {missed} not reported", flush=True)
     return 1 if missed + _plausible(given.runs) else 0
 
 
@@ -125,7 +125,7 @@ def _plausible(count: int) -> int:
     print(
         f"{count} plausible runs, {refused} fail; {1e3 * np.median(seconds):.0f} ms each, at most {max(seconds):.2f} s"
     )
-    print("told of them: " + ", ".join(f"{what} {number}" for what, number in noted.most_common()))
+    print("reported of them: " + ", ".join(f"{what} {number}" for what, number in noted.most_common()))
     return refused
 
 

@@ -129,11 +129,11 @@ def bank_figures(
             larger.append(np.maximum(*both))
     median = np.median(larger, axis=0)
     beyond = np.flatnonzero(median > 20.0)
-    told = {f"{minute} min": round(float(median[60 * minute - 1]), 1) for minute in minutes}
+    by_minutes = {f"{minute} min": round(float(median[60 * minute - 1]), 1) for minute in minutes}
     return {
         "sky": constellation,
         "bank": name + " Doppler" * velocity,
-        **told,
+        **by_minutes,
         "20 m after min": beyond[0] / 60 if beyond.size else None,
     }
 
@@ -151,7 +151,7 @@ def _with_doppler(rows: Watched) -> Watched:
 def shape_figures(constellation: Constellation, repetitions: int, minutes: tuple[int, ...]) -> list[dict[str, object]]:
     """Medians of what steps and ramps may become, by the default bank."""
     sky, alphas = default_geometry(constellation), np.array(BANKS["0.1 0.01 0.001"])
-    told: list[dict[str, object]] = []
+    figures: list[dict[str, object]] = []
     for shape in SHAPES:
         larger = []
         for repetition in range(repetitions):
@@ -162,10 +162,10 @@ def shape_figures(constellation: Constellation, repetitions: int, minutes: tuple
                 both = (rows, rows.mirrored())
                 larger.append([max(largest_of_shape(one.since(_WARM_S, end), shape) for one in both) for end in ends])
         median = np.median(larger, axis=0)
-        told.append(
+        figures.append(
             {"sky": constellation, "shape": shape} | {f"{m} min": v for m, v in zip(minutes, median, strict=True)}
         )
-    return told
+    return figures
 
 
 def ramp_figures(draws: int) -> list[dict[str, object]]:
@@ -184,14 +184,14 @@ def ramp_figures(draws: int) -> list[dict[str, object]]:
         steepest.append(largest_of_shape(window, "ramp", np.array([1])) / seconds)
     # The bank of the draws has run for as long since its restart.
     bank = linear_bank(sky, heading, BankSpec(alphas=(1.0, *alphas.tolist()), age_s=float(_WARM_S)))
-    told: list[dict[str, object]] = []
+    figures: list[dict[str, object]] = []
     for rate_mps in (0.012, 0.015, 0.018, 0.021, 0.024):
         share = float(np.mean(np.array(steepest) >= rate_mps))
         sampled = missed_detection_probability(bank, seconds, rate_mps / abs(float(bank.slope[0])), runs=20_000)
         deviation = np.hypot(
             np.sqrt(sampled.value * (1.0 - sampled.value) / draws), sampled.relative_error * sampled.value
         )
-        told.append(
+        figures.append(
             {
                 "ramp m/s": rate_mps,
                 "share unseen": share,
@@ -199,7 +199,7 @@ def ramp_figures(draws: int) -> list[dict[str, object]]:
                 "sigmas apart": (share - sampled.value) / max(float(deviation), 1e-12),
             }
         )
-    return told
+    return figures
 
 
 def range_figure(constellation: Constellation, heading_deg: float) -> float:

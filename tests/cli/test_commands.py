@@ -194,7 +194,7 @@ def test_inspect(balise: Balise, small_trial: SmallTrial, result: Path) -> None:
 
 def test_inspect_a_site_against_the_runs_over_it(balise: Balise, small_trial: SmallTrial, result: Path) -> None:
     found = json.loads(balise("inspect", small_trial.site, "--result", result, "--json").out)["Survey"]
-    # Both runs are parts of one journey, so only which rows there are is told, not how they come out.
+    # Both runs are parts of one journey, so only which rows there are is tested, not how they come out.
     assert {row["axis"] for row in found} == {"cross", "vertical"}
     assert {row["netelement_id"] for row in found} == {"NE1"}
     assert {row["runs"] for row in found} == {2}
@@ -239,9 +239,11 @@ def test_every_parquet_file_has_its_name_and_meanings(
         found = describe(file.read_bytes())
         name = f"campaign_{file.stem}" if folder == "campaign" else file.stem
         assert found.metadata["balise.table"].replace("/", "_") == name
-        told = {row["column"]: (row["unit"], row["meaning"]) for row in found.columns.iter_rows(named=True)}
-        assert told == {key: tuple(note.values()) for key, note in meanings(schemas[name]).items() if key in told}
-        assert all(meaning for _, meaning in told.values())
+        documented = {row["column"]: (row["unit"], row["meaning"]) for row in found.columns.iter_rows(named=True)}
+        assert documented == {
+            key: tuple(note.values()) for key, note in meanings(schemas[name]).items() if key in documented
+        }
+        assert all(meaning for _, meaning in documented.values())
 
 
 def test_convert_into_a_run_that_exists(balise: Balise, tmp_path: Path) -> None:
@@ -423,9 +425,9 @@ def test_version(balise: Balise) -> None:
 
 @pytest.mark.parametrize("command", sorted(typer.main.get_command(cli.app).commands))  # type: ignore[attr-defined]
 def test_every_help_has_examples(balise: Balise, command: str) -> None:
-    told = balise(command, "-h")
-    assert told.status == 0
-    assert f"balise {command}" in told.out.partition("Examples:")[2]
+    shown = balise(command, "-h")
+    assert shown.status == 0
+    assert f"balise {command}" in shown.out.partition("Examples:")[2]
 
 
 @pytest.mark.parametrize("command", sorted(typer.main.get_command(cli.app).commands))  # type: ignore[attr-defined]

@@ -122,8 +122,8 @@ def test_faults_stream() -> None:
     seconds = [(row["t_start"].timestamp(), row["t_end"].timestamp()) for row in rows]
     # A ramp that stays lasts to the end of the run, and nothing lasts longer.
     assert seconds == [(2.0, 10.0), (2.0, 2.5), (3.0, 10.0), (5.0, 7.0)]
-    told = [(row["kind"], row["target"], row["size"], row["rate"]) for row in rows]
-    assert told == [
+    recorded = [(row["kind"], row["target"], row["size"], row["rate"]) for row in rows]
+    assert recorded == [
         ("ramp", "along", 2.0, 0.5),
         ("slip", "odometer", 3.0, 6.0),
         ("step", "along", 30.0, None),

@@ -125,11 +125,11 @@ def test_one_solution_alone_may_be_hit(clean: RunLog) -> None:
     assert gap_m(hit, clean.gnss) > 10.0
 
 
-def test_faults_add_up_and_are_told(clean: RunLog) -> None:
+def test_faults_add_up_and_are_recorded(clean: RunLog) -> None:
     faults = [fault(kind="outage", start_s=90.0, duration_s=2.0), fault(kind="bias", size_m=5.0, start_s=20.0)]
-    told = inject_all(clean, faults).faults
-    assert told is not None
-    assert told["kind"].to_list() == ["bias", "outage"]
+    recorded = inject_all(clean, faults).faults
+    assert recorded is not None
+    assert recorded["kind"].to_list() == ["bias", "outage"]
 
 
 def test_the_same_noise_every_time_and_not_between_runs(clean: RunLog) -> None:

@@ -27,17 +27,17 @@ def fields(section: str) -> dict[str, str]:
     return found
 
 
-def places(value: Any, told: dict[str, str], place: str = "") -> Iterator[str]:
+def places(value: Any, meanings: dict[str, str], place: str = "") -> Iterator[str]:
     """Places of all fields. Rows of a table of the dictionary are held against its columns."""
-    meaning = told.get(place, "")
+    meaning = meanings.get(place, "")
     if isinstance(value, list):
         rows = [row for row in value if isinstance(row, dict)]
         if table := re.search("ows of table `(.+?)`", meaning):
             assert {name for row in rows for name in row} <= COLUMNS[table[1]] | {"run_id"}
         else:
-            yield from (name for row in rows for name in places(row, told, f"{place}[]"))
+            yield from (name for row in rows for name in places(row, meanings, f"{place}[]"))
     elif isinstance(value, dict) and "by name" not in meaning:
         for name, item in value.items():
             inner = f"{place}.{name}" if place else name
             yield inner
-            yield from places(item, told, inner)
+            yield from places(item, meanings, inner)

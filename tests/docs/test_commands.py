@@ -22,10 +22,10 @@ ANNOUNCED = re.compile(r"# exit status (\d)")
 def lines(page: Path) -> list[tuple[list[str], int]]:
     """Commands with their exit status."""
     texts = [line for block in blocks(page) if block.language in ("", "sh") for line in block.text.splitlines()]
-    told = [ANNOUNCED.search(line) for line in texts if re.match(r"(balise|make)\b", line)]
+    announced = [ANNOUNCED.search(line) for line in texts if re.match(r"(balise|make)\b", line)]
     return [
         (command, int(status[1]) if status else 0)
-        for command, status in zip(commands(page), told, strict=True)
+        for command, status in zip(commands(page), announced, strict=True)
         if command[0] == "balise"
     ]
 
@@ -74,8 +74,10 @@ def test_links_lead_somewhere(page: Path) -> None:
 
 def test_every_command_is_in_some_guide() -> None:
     known = typer.main.get_command(cli.app)
-    told = {command[0][1] for page in PAGES for command in lines(page)} | {n for page in PAGES for n in mentioned(page)}
-    assert set(known.commands) <= told  # type: ignore[attr-defined]
+    described = {command[0][1] for page in PAGES for command in lines(page)} | {
+        n for page in PAGES for n in mentioned(page)
+    }
+    assert set(known.commands) <= described  # type: ignore[attr-defined]
 
 
 def run_commands(page: Path, workplace: Path, capfd: pytest.CaptureFixture[str]) -> None:

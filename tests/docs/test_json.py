@@ -56,17 +56,17 @@ def _examples() -> Iterator[Block]:
 @pytest.mark.parametrize("section", sorted(set(SECTIONS) - SLOW))
 def test_answers_have_the_fields_of_the_page(section: str, workplace: Path, capfd: pytest.CaptureFixture[str]) -> None:
     _prepare(workplace)
-    told = fields(section)
-    always = {place for place, meaning in told.items() if "." not in place and not meaning.startswith("only ")}
-    seen: set[str] = set()
+    documented = fields(section)
+    always = {place for place, meaning in documented.items() if "." not in place and not meaning.startswith("only ")}
+    answered: set[str] = set()
     for block in _examples():
         for line in block.text.splitlines() if block.heading == f"`{section}`" else ():
             found = _answer(line, capfd)
             assert isinstance(found, list) is (section in ARRAYS)
-            there = set() if section in ARRAYS else set(places(found, told))
+            there = set() if section in ARRAYS else set(places(found, documented))
             assert always <= there
-            seen |= there
-    assert seen == set(told) - UNSEEN.get(section, set())
+            answered |= there
+    assert answered == set(documented) - UNSEEN.get(section, set())
 
 
 def _prepare(folder: Path) -> None:

@@ -33,9 +33,9 @@ def test_sql_and_polars_agree(sql: Block, python: Block, asked: Path, monkeypatc
     monkeypatch.chdir(asked)
     names: dict[str, Any] = {}
     exec(PREAMBLE + python.text, names)
-    answer, told = names["answer"].collect(), run_sql("OUT", sql.text)
-    assert answer.columns == told.columns
-    assert_same_rows(answer, told)
+    answer, by_sql = names["answer"].collect(), run_sql("OUT", sql.text)
+    assert answer.columns == by_sql.columns
+    assert_same_rows(answer, by_sql)
 
 
 @pytest.mark.parametrize("sql", [sql for sql, _ in PAIRS], ids=lambda block: block.heading[:40])
@@ -47,9 +47,9 @@ def test_duckdb_gives_the_same(sql: Block, asked: Path, monkeypatch: pytest.Monk
             connection.execute(VIEW_OF_FILES.replace("hazards", name))
         connection.execute("CREATE VIEW campaign_runs AS SELECT * FROM 'OUT/campaign/runs.parquet'")
         found = pl.from_arrow(connection.sql(sql.text).to_arrow_table())
-    told = run_sql("OUT", sql.text)
-    assert told.columns == found.columns
-    assert_same_rows(found, told)
+    ours = run_sql("OUT", sql.text)
+    assert ours.columns == found.columns
+    assert_same_rows(found, ours)
 
 
 VIEWS = [view for view in views.views().values() if not view.needs]
@@ -64,11 +64,11 @@ def test_duckdb_answers_the_views_alike(asked: Path, monkeypatch: pytest.MonkeyP
         for view in VIEWS:
             connection.execute(f"CREATE VIEW {view.name} AS {view.sql}")
             found = pl.from_arrow(connection.sql(f"SELECT * FROM {view.name}").to_arrow_table())
-            told = run_sql("OUT", f"SELECT * FROM {view.name}")
-            assert told.height > 0, view.name
-            assert told.columns == found.columns
-            of_runs = [name for name in told.columns if name == "run_ids"]
-            assert_same_rows(*(frame.with_columns(pl.col(of_runs).list.sort()) for frame in (found, told)))
+            ours = run_sql("OUT", f"SELECT * FROM {view.name}")
+            assert ours.height > 0, view.name
+            assert ours.columns == found.columns
+            of_runs = [name for name in ours.columns if name == "run_ids"]
+            assert_same_rows(*(frame.with_columns(pl.col(of_runs).list.sort()) for frame in (found, ours)))
 
 
 def test_by_epochs_and_by_runs_availability_is_the_same(asked: Path) -> None:
@@ -76,12 +76,12 @@ def test_by_epochs_and_by_runs_availability_is_the_same(asked: Path) -> None:
         "SELECT run_id, solution, 1 - SUM(lost_s) / SUM(moving_s) AS share FROM stretches GROUP BY run_id, solution"
     )
     of_runs = "SELECT run_id, solution, availability FROM runs WHERE availability IS NOT NULL"
-    shares, told = (
+    shares, by_run = (
         {(run, solution): share for run, solution, share in run_sql(asked / "OUT", sql).rows()}
         for sql in (by_epochs, of_runs)
     )
-    assert len(told) > 5
-    assert {run: shares[run] for run in told} == pytest.approx(told)
+    assert len(by_run) > 5
+    assert {run: shares[run] for run in by_run} == pytest.approx(by_run)
 
 
 def test_there_are_ten_questions_on_views() -> None:

@@ -108,8 +108,8 @@ def main() -> int:
         for what, sampled, counted in comparisons(target):
             met = agree(sampled, counted)
             apart += not met
-            told = f"sampled {sampled.value:.3g} +- {sampled.relative_error:.0%}, counted {counted.value:.3g}"
-            print(f"{target:g} {what}: {told} in {counted.runs}{'' if met else ', apart'}", flush=True)
+            line = f"sampled {sampled.value:.3g} +- {sampled.relative_error:.0%}, counted {counted.value:.3g}"
+            print(f"{target:g} {what}: {line} in {counted.runs}{'' if met else ', apart'}", flush=True)
     return 1 if apart > 1 else 0
 
 

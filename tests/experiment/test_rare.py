@@ -185,7 +185,7 @@ def test_the_first_time_below_a_target_by_hand() -> None:
     assert first_below(lambda epochs: 0.0, (1e-3,), 100) == [None]
 
 
-def test_no_probability_below_1e_12_is_told() -> None:
+def test_no_probability_below_1e_12_is_stated() -> None:
     """And none that came out as zero: that no run came through proves nothing."""
     wanted = {1e-12: (1e-12, None, 0.1), 9e-13: (None, 1e-12, None), 0.0: (None, None, None)}
     for value, expected in wanted.items():

@@ -291,9 +291,9 @@ def test_every_figure_of_ten_pages_is_that_of_the_tables(replayed: dict[str, Run
     for run, tables in ten.items():
         page = Page((tmp_path / "report" / "runs" / f"{run}.html").read_text(encoding="utf-8"))
         counted = recounted(tables)
-        told = {name: page.values[name][0] for name in counted if name in page.values}
-        assert told == {name: value for name, value in counted.items() if name in page.values}
-        assert set(counted) - set(told) == {"balises", "faults"}
+        on_page = {name: page.values[name][0] for name in counted if name in page.values}
+        assert on_page == {name: value for name, value in counted.items() if name in page.values}
+        assert set(counted) - set(on_page) == {"balises", "faults"}
         assert counted["balises"] in page.text
         figures = {row[0]: row[1] for row in page.tables["table-all-s0"]}
         assert figures["faults"] == counted["faults"] or tables.runs["evidence"][0] is None

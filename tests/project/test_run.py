@@ -321,7 +321,7 @@ def test_a_verdict_is_held_against_raw_logs(project: Path, capsys: pytest.Captur
     assert "run still, gnss" in capsys.readouterr().out
 
 
-def test_the_digest_of_the_manifest_is_told_and_expected(project: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_digest_of_the_manifest_is_printed_and_expected(project: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert call("run") == 0
     digest = hashlib.sha256((project / "result/manifest.json").read_bytes()).hexdigest()
     assert f"manifest.json: sha256 {digest} of 1 run\n" in capsys.readouterr().out

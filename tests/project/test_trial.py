@@ -45,15 +45,15 @@ def log(name: str, begin_min: float, end_min: float, stream: str = "gnss") -> In
 def test_logs_of_one_ride(logs: list[InspectedLog], recorded_runs: list[list[str]]) -> None:
     found, alone = group_into_runs(logs, [])
     assert alone == []
-    told = [
+    runs = [
         ["+".join(file.path.name for file in files) for files in recorded_run.receivers]
         + [other.path.name for other in recorded_run.others]
         for recorded_run in found
     ]
-    assert told == recorded_runs
+    assert runs == recorded_runs
 
 
-def test_a_log_of_no_ride_is_told() -> None:
+def test_a_log_of_no_ride_is_reported() -> None:
     _, alone = group_into_runs([log("a.ubx", 0, 1), log("b.ubx", 90, 91), log("o.csv", 30, 31, "odometer")], [])
     assert [one.path.name for one in alone] == ["o.csv"]
 
@@ -269,6 +269,6 @@ def test_why_no_log_holds_positions(raw: Path, capsys: pytest.CaptureFixture[str
     rows = "".join(f"2025-03-03 10:12:{second:02d},50.1,14.2\n" for second in range(40))
     (raw / "raw" / "gnss.csv").write_text("Time (CEST),lat,lon\n" + rows)
     assert call("trial", "raw", "--track", "line.gpx", "--to", "week12") != 0
-    told = capsys.readouterr().err
-    assert "no log holds positions" in told
-    assert "in 'CEST', which is not UTC" in told
+    errors = capsys.readouterr().err
+    assert "no log holds positions" in errors
+    assert "in 'CEST', which is not UTC" in errors

@@ -78,8 +78,8 @@ class _Asked:
 
     def _key(self) -> tuple[object, ...]:
         parts = [id(getattr(whole, part.name)) for whole in (self.run, self.site) for part in fields(whole)]
-        told = [setting.model_dump_json() if setting else None for setting in (self.vehicle, self.config)]
-        return self.run.run_id, *parts, *told
+        settings = [setting.model_dump_json() if setting else None for setting in (self.vehicle, self.config)]
+        return self.run.run_id, *parts, *settings
 
     def __hash__(self) -> int:
         return hash(self._key())

@@ -69,7 +69,7 @@ def test_odometer_alone_does_not_see_an_offset_within_its_confidence_and_says_so
     assert "never that it was right" not in with_reference
 
 
-def test_balises_accepted_while_no_odometer_could_contradict_are_told():
+def test_balises_accepted_while_no_odometer_could_contradict_are_reported():
     run, site = journey(OFFSET)
     undiagnosed = "virtual balises accepted without a monitor along the track"
     assert undiagnosed not in (replay(run, site, VEHICLE).runs["notes"].item() or "")
@@ -99,16 +99,16 @@ def test_balises_accepted_while_no_odometer_could_contradict_are_told():
         assert f"the odometer {word}" in notes
 
 
-def test_positions_left_out_for_their_time_are_told():
+def test_positions_left_out_for_their_time_are_reported():
     run, site = journey(OFFSET)
     undated = run.gnss.head(3).with_columns((pl.col("t") - timedelta(weeks=1024)).cast(run.gnss["t"].dtype))
     doubled = run.gnss[500:510].with_columns(pl.col("latitude_deg") + 0.001)
     both = run.with_streams(gnss=pl.concat([undated, run.gnss, doubled]))
-    told, plain = replay(both, site, VEHICLE).runs, replay(run, site, VEHICLE).runs
-    assert "3 positions left out: their time is more than a day from the others" in told["notes"].item()
-    assert "10 positions left out: they contradict an earlier record with the same time stamp" in told["notes"].item()
-    assert told["duration_s"].item() == plain["duration_s"].item()
-    assert told["distance_m"].item() == plain["distance_m"].item()
+    row, plain = replay(both, site, VEHICLE).runs, replay(run, site, VEHICLE).runs
+    assert "3 positions left out: their time is more than a day from the others" in row["notes"].item()
+    assert "10 positions left out: they contradict an earlier record with the same time stamp" in row["notes"].item()
+    assert row["duration_s"].item() == plain["duration_s"].item()
+    assert row["distance_m"].item() == plain["distance_m"].item()
 
 
 @pytest.mark.parametrize("kind", ["reference", "balise", "odometer"])
@@ -231,7 +231,7 @@ def test_a_balise_read_inside_an_outage_is_placed_by_the_odometer_of_then():
     assert "wrong" not in set(tables.epochs["judgement"])
 
 
-def test_balises_that_lie_off_their_net_element_are_told():
+def test_balises_that_lie_off_their_net_element_are_reported():
     run, site = journey(OFFSET)
     assert "off their net element" not in (replay(run, site, VEHICLE).runs["notes"].item() or "")
     finding = Finding("error", "balises: VB9", "measure 99999.0 m is off element A", "Correct measure_m.")
@@ -274,20 +274,20 @@ def test_errors_are_the_same_by_a_reference_of_few_samples(period_s):
 def test_offset_is_found_by_a_reference_of_few_samples():
     run, site = journey({**OFFSET, "size_m": 60.0})
     dense, sparse = (replay(log, site, VEHICLE).hazards for log in (run, thinned(run, 5.0)))
-    told = ("hazard", "failure_mode", "timing", "evidence", "balise_ids", "accepted_ids", "detected")
-    assert dense.select(told).rows() == sparse.select(told).rows() != []
+    columns = ("hazard", "failure_mode", "timing", "evidence", "balise_ids", "accepted_ids", "detected")
+    assert dense.select(columns).rows() == sparse.select(columns).rows() != []
     assert sparse["evidence"].unique().to_list() == ["reference"]
     assert sparse["size_m"][0] == pytest.approx(60.0, abs=5.0)
 
 
 def test_without_an_odometer_a_reference_of_few_samples_tells_nothing_between_them():
     run, site = journey({**OFFSET, "size_m": 60.0})
-    told = replay(thinned(run, 5.0).with_streams(odometer=None), site, VEHICLE)
-    assert (told.epochs["judgement"] == "unknown").mean() > 0.95
-    assert told.runs["verdict"].item() != "safe"
+    tables = replay(thinned(run, 5.0).with_streams(odometer=None), site, VEHICLE)
+    assert (tables.epochs["judgement"] == "unknown").mean() > 0.95
+    assert tables.runs["verdict"].item() != "safe"
 
 
-def test_a_counter_that_is_reset_costs_nothing_and_is_told():
+def test_a_counter_that_is_reset_costs_nothing_and_is_reported():
     run, site = journey()
     row = pl.int_range(pl.len())
     reset = pl.col("distance_m") - pl.when(row >= 4000).then(2000.0).otherwise(0.0)

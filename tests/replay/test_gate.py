@@ -57,8 +57,8 @@ for stream in ("gnss", "odometer", "satellites", "reference", "balise_reads"):
 def test_a_gap_of_a_century_in_any_stream() -> None:
     done = subprocess.run([sys.executable, "-c", _SCRIPT], capture_output=True, text=True, timeout=300, check=False)
     assert done.returncode == 0, done.stderr[-2000:]
-    told = [tuple(line.split("|")) for line in done.stdout.splitlines()]
-    assert told == [
+    outcomes = [tuple(line.split("|")) for line in done.stdout.splitlines()]
+    assert outcomes == [
         ("gnss", "failed,ok", "1"),
         ("odometer", "run: odometer, column t: lasts longer than a journey", "1"),
         ("satellites", "ok,ok", "0"),

@@ -86,8 +86,8 @@ def test_a_jump_of_the_position_is_no_movement():
     jump = {"kind": "step", "size_m": 300.0, "start_s": 250.0, "duration_s": 6.0}
     run, site = journey(jump, motion=STOP)
     assert set(between(replay(run, site, VEHICLE), 245.0, 260.0)["moving"]) == {False}
-    told = replay(run.with_streams(reference=None), site, VEHICLE)
-    assert True not in set(between(told, 245.0, 260.0)["moving"])
+    tables = replay(run.with_streams(reference=None), site, VEHICLE)
+    assert True not in set(between(tables, 245.0, 260.0)["moving"])
 
 
 def test_the_report_counts_the_epochs_of_a_frozen_odometer():

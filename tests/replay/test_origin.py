@@ -137,9 +137,9 @@ def test_without_an_odometer_there_is_no_origin() -> None:
     assert "odometer_origin_unknown" not in found["reasons"]
 
 
-@pytest.mark.parametrize(("origin", "told"), [(Origin.WHEEL, True), (None, False), (Origin.GNSS, False)])
-def test_only_an_independent_odometer_tells_motion(origin: Origin | None, told: bool) -> None:
+@pytest.mark.parametrize(("origin", "known"), [(Origin.WHEEL, True), (None, False), (Origin.GNSS, False)])
+def test_only_an_independent_odometer_tells_motion(origin: Origin | None, known: bool) -> None:
     run, site = journey(gnss=GNSS, motion=MOTION)
     tables = replay(said(run, origin).with_streams(reference=None), site, VEHICLE)
-    assert tables.epochs["moving"].is_not_null().any() is told
-    assert (row(tables)["availability"] is not None) is told
+    assert tables.epochs["moving"].is_not_null().any() is known
+    assert (row(tables)["availability"] is not None) is known

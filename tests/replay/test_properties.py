@@ -117,9 +117,9 @@ def test_a_run_split_between_balises_loses_no_hazard(at_s):
     columns = ("hazard", "balise_ids", "t_hazard", "t_onset", "timing", "detected", "t_detected")
     assert_frame_equal(pl.concat(part.hazards for part in parts).select(columns), whole.hazards.select(columns))
     # The balise that is passed as the log is cut belongs to neither part, all others to one.
-    told = [row for part in parts for row in part.passages.filter(kind="virtual")["balise_id"].to_list()]
+    balises = [row for part in parts for row in part.passages.filter(kind="virtual")["balise_id"].to_list()]
     expected = whole.passages.filter(kind="virtual")["balise_id"].to_list()
-    assert told == [name for name in expected if at_s is not None or name != "VB1"]
+    assert balises == [name for name in expected if at_s is not None or name != "VB1"]
 
 
 @pytest.mark.parametrize("kind", ["step", "ramp"])

@@ -53,8 +53,8 @@ def test_an_odometer_that_slips_within_its_confidence_is_p0_again_after_the_reco
     """30 m lost, found at once; since the LRVB, 2 km before, that is within 5 m + 5 %."""
     slip = {"kind": "slip", "rate_mps": 15.0, "start_s": 150.0, "duration_s": 2.0}
     tables = states({}, VEHICLE, slip)
-    told = tables.epochs["lds_state"].rle().struct.unnest()
-    assert told.filter(pl.col("len") > 5)["value"].to_list() == ["P0", "P2", "P0"]
+    phases = tables.epochs["lds_state"].rle().struct.unnest()
+    assert phases.filter(pl.col("len") > 5)["value"].to_list() == ["P0", "P2", "P0"]
     assert tables.hazards.height == 0
 
 

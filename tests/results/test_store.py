@@ -77,9 +77,11 @@ def test_every_field_tells_unit_and_meaning(tmp_path: Path) -> None:
     store.write_run(tables_of("r1"), tmp_path, METADATA)
     for name, contract in TABLES.items():
         schema = pq.read_schema(tmp_path / f"{name}/run_id=r1/{name}.parquet")
-        told = {field.name: (field.metadata[b"unit"].decode(), field.metadata[b"meaning"].decode()) for field in schema}
+        noted = {
+            field.name: (field.metadata[b"unit"].decode(), field.metadata[b"meaning"].decode()) for field in schema
+        }
         columns = contract.columns().items()
-        assert told == {column: ((rule.metadata or {}).get("unit", ""), rule.description) for column, rule in columns}
+        assert noted == {column: ((rule.metadata or {}).get("unit", ""), rule.description) for column, rule in columns}
         assert store.read_table(tmp_path, name, "r1").drop("run_id").collect_schema() == contract.create_empty().schema
 
 

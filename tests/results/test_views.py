@@ -133,8 +133,8 @@ def test_what_changed_needs_the_other_result(out: Path, tmp_path: Path) -> None:
     assert run_sql(out, "SELECT * FROM changes", others={"old": out}).height == 0
     old = written(tmp_path, "safe", failures=2)
     found = run_sql(out, "SELECT * FROM changes", others={"old": old}).row(0, named=True)
-    told = ("run_id", "verdict_old", "verdict", "failures_old", "failures")
-    assert [found[name] for name in told] == ["a", "safe", "unproven", 2, 0]
+    columns = ("run_id", "verdict_old", "verdict", "failures_old", "failures")
+    assert [found[name] for name in columns] == ["a", "safe", "unproven", 2, 0]
 
 
 def test_a_view_of_the_other_result_has_its_name(out: Path) -> None:

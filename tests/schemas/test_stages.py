@@ -88,6 +88,6 @@ def test_every_column_between_stages_tells_its_meaning_and_unit():
         if isinstance(node, ast.AnnAssign) and isinstance(node.target, ast.Name)
     ]
     assert len(columns) > 40
-    for name, kind, told in columns:
-        assert told.startswith(('"', "'")), name
-        assert kind != "Floats" or "[" in told or "the same" in told.lower(), name
+    for name, kind, text in columns:
+        assert text.startswith(('"', "'")), name
+        assert kind != "Floats" or "[" in text or "the same" in text.lower(), name

@@ -15,10 +15,10 @@ WIDE = pl.DataFrame({f"column_{number}": [number * 1000.0 + row for row in range
 def test_columns_that_do_not_fit_are_counted(width: int) -> None:
     lines = table_lines(WIDE, width)
     assert max(map(len, lines)) <= width
-    told = " ".join(lines[-2:])
+    remark = " ".join(lines[-2:])
     # `column_29` takes seven characters where it breaks behind the underscore, and two blanks part columns.
     fitting = (width + 2) // 9
-    assert f"{30 - fitting} of 30 columns are left out: they do not fit {width} characters" in told
+    assert f"{30 - fitting} of 30 columns are left out: they do not fit {width} characters" in remark
     assert len(lines[2].split()) == fitting
     assert len([line for line in lines if line.split()[0].isdigit()]) == 1 + WIDE.height + 1
 
@@ -82,9 +82,11 @@ def test_a_word_longer_than_the_line_breaks_behind_its_signs() -> None:
     assert "".join(lines[1:]) == path
 
 
-@pytest.mark.parametrize(("room", "told"), [(10, "2 failed or partial"), (44, "2 failed or partial, 5 min 3 s left")])
-def test_progress_says_what_fits(room: int, told: str) -> None:
-    assert as_fits(["2 failed or partial", "5 min 3 s left", "1.32 runs/s"], room) == told
+@pytest.mark.parametrize(
+    ("room", "fitting"), [(10, "2 failed or partial"), (44, "2 failed or partial, 5 min 3 s left")]
+)
+def test_progress_says_what_fits(room: int, fitting: str) -> None:
+    assert as_fits(["2 failed or partial", "5 min 3 s left", "1.32 runs/s"], room) == fitting
 
 
 def test_in_a_pipe_nothing_is_left_out() -> None:

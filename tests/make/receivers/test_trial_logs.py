@@ -56,7 +56,7 @@ def test_a_velocity_of_novatel_is_as_old_as_it_says(tmp_path):
     log = tmp_path / "a.gps"
     speeds = {506712.0: 10.0, 506713.0: 11.0, 506714.0: 12.0, 506716.0: 14.0}
     log.write_bytes(b"".join(bestposa(at) + bestvela(at, 0.25, speed) for at, speed in speeds.items()))
-    # A quarter of a second later than told, at 1 m/s2; nothing is known where the next velocity is missing.
+    # A quarter of a second later than stated, at 1 m/s2; nothing is known where the next velocity is missing.
     assert convert([log], "r").run.gnss["vel_e_mps"].to_list() == pytest.approx([10.25, 11.25, None, None])
     log.write_bytes(b"".join(bestvela(at, 0.0, speed) + bestposa(at) for at, speed in speeds.items()))
     assert convert([log], "r").run.gnss["vel_e_mps"].to_list() == pytest.approx([10.0, 11.0, 12.0, 14.0])
@@ -173,8 +173,8 @@ def test_several_receivers_make_one_run(tmp_path):
     truth = extended(run, HERE, rover, Purpose(stream="reference"), FixSigma(), force=False).run
     assert truth.gnss.equals(run.gnss)
     assert truth.reference is not None
-    told = rover.streams["gnss"].row(0, named=True)
-    ellipse = [[told["cov_ee_m2"], told["cov_en_m2"]], [told["cov_en_m2"], told["cov_nn_m2"]]]
+    covariance = rover.streams["gnss"].row(0, named=True)
+    ellipse = [[covariance["cov_ee_m2"], covariance["cov_en_m2"]], [covariance["cov_en_m2"], covariance["cov_nn_m2"]]]
     assert truth.reference["sigma_m"].to_list() == pytest.approx([np.linalg.eigvalsh(ellipse)[1] ** 0.5] * 3)
     with pytest.raises(UsageError, match=r"--solution: is empty"):
         extended(run, HERE, rover, Purpose(" "), FixSigma(), force=False)

@@ -11,7 +11,7 @@ from pipeline.make.survey.pieces import Survey
 from pipeline.make.survey.trace import clean_traces
 from schemas.config import SurveyConfig
 from schemas.errors import BaliseError
-from tests.make.survey.test_site_of_survey import degrees, recorded, site_of, told, track_csv, way, written
+from tests.make.survey.test_site_of_survey import degrees, findings_text, recorded, site_of, track_csv, way, written
 
 # Another value for each key.
 OTHERS = {
@@ -62,7 +62,7 @@ def drawn(folder: Path, **keys: float) -> tuple[str, ...]:
     ):
         try:
             site = site_of(survey, balises=balises, config=keys)
-            made.append(f"{told(site)} {site.track.rows()} {site.links.rows()}")
+            made.append(f"{findings_text(site)} {site.track.rows()} {site.links.rows()}")
         except BaliseError as error:
             made.append(str(error))
     return tuple(one.replace(str(folder), "") for one in made)

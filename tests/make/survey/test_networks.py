@@ -16,7 +16,7 @@ from pipeline.read.site.read import read_site
 from pipeline.show.inspection import inspect_path
 from schemas.errors import BaliseError, SiteError
 from schemas.run import Site
-from tests.make.survey.test_site_of_survey import INFRABEL, site_of, told, way, written
+from tests.make.survey.test_site_of_survey import INFRABEL, findings_text, site_of, way, written
 from tests.read.site import builders
 
 Relation = tuple[str, int, str, int, str]
@@ -92,7 +92,7 @@ def test_relations_are_kept_as_given_however_they_are_spelled(tmp_path: Path, sp
     assert rows(site) == given
     assert rows(read_site(network(tmp_path, given, spelled))) == given
     assert site.track["netelement_id"].unique(maintain_order=True).to_list() == ["a", "b", "c", "d"]
-    assert "angle" not in told(site)
+    assert "angle" not in findings_text(site)
 
 
 def test_elements_of_a_network_are_neither_cut_nor_joined_by_what_lies_there(tmp_path: Path) -> None:
@@ -109,7 +109,7 @@ def test_elements_of_a_network_are_neither_cut_nor_joined_by_what_lies_there(tmp
     site = site_of(written(tmp_path, "n.geojson", *lines, relation))
     assert site.track["netelement_id"].unique(maintain_order=True).to_list() == ["m", "n", "x", "o"]
     assert rows(site) == [("m", 1, "o", 0, "both")]
-    assert "track: n: end 0 lies 0.0 m from the middle of m and is not joined to it" in told(site)
+    assert "track: n: end 0 lies 0.0 m from the middle of m and is not joined to it" in findings_text(site)
 
 
 def test_ends_that_no_relation_names_are_joined_by_angle_with_a_warning(tmp_path: Path) -> None:
@@ -128,7 +128,7 @@ def test_lines_alone_are_joined_by_angle_with_a_note(tmp_path: Path) -> None:
     assert finding.severity == "note"
 
 
-def test_a_missing_element_and_two_words_for_one_pair_are_told(tmp_path: Path) -> None:
+def test_a_missing_element_and_two_words_for_one_pair_are_reported(tmp_path: Path) -> None:
     given: list[Relation] = [
         ("a", 1, "b", 0, "AB"),
         ("b", 0, "a", 1, "AB"),
@@ -137,7 +137,7 @@ def test_a_missing_element_and_two_words_for_one_pair_are_told(tmp_path: Path) -
     ]
     site = site_of(network(tmp_path, [*given, ("c", 0, "b", 1, "both"), ("d", 0, "a", 1, "BA")]))
     assert ("c", 1, "gone", 0, "both") not in rows(site)
-    assert "relation c - gone is not used: it names an element not in the track" in told(site)
+    assert "relation c - gone is not used: it names an element not in the track" in findings_text(site)
     # The same said from the other side is no difference.
     assert [one.message for one in site.findings if "are related as" in one.message] == [
         "end 1 of a and end 0 of b are related as AB and as BA: what either allows counts"
@@ -182,7 +182,7 @@ def test_a_real_network_keeps_one_way_tracks(tmp_path: Path) -> None:
     keys = ("netelementA", "positionOnA", "netelementB", "positionOnB", "navigability")
     assert rows(site) == [tuple(relation[key] for key in keys) for relation in relations]
     assert site.track["netelement_id"].n_unique() == 74
-    assert "angles" not in told(site)
+    assert "angles" not in findings_text(site)
 
 
 def test_a_file_without_relations_is_no_site_to_replay_on(tmp_path: Path) -> None:
@@ -198,7 +198,7 @@ def test_a_file_without_relations_is_no_site_to_replay_on(tmp_path: Path) -> Non
 
 
 def test_a_stretch_that_two_elements_share_stays_with_both(tmp_path: Path) -> None:
-    """Twice the same track is doubtful, and told, but what the network names is not left out of it."""
+    """Twice the same track is doubtful, and reported, but what the network names is not left out of it."""
     site = site_of(network(tmp_path, [("a", 1, "b", 0, "both"), ("b", 1, "c", 0, "both"), ("a", 1, "d", 0, "AB")]))
     document = json.loads((tmp_path / "network.geojson").read_text())
     twin = {"type": "LineString", "coordinates": [list(point) for point in builders.POINTS["b"]]}

@@ -66,7 +66,7 @@ def navigable(site: Site) -> set[frozenset[tuple[str, int]]]:
     return {frozenset([(a, a_end), (b, b_end)]) for a, a_end, b, b_end, _ in rows}
 
 
-def told(site: Site) -> str:
+def findings_text(site: Site) -> str:
     return "\n".join(f"{one.place}: {one.message}" for one in site.findings)
 
 
@@ -82,8 +82,8 @@ def test_a_switch_lies_where_three_meet_and_no_train_turns_back_over_it(tmp_path
     }
     assert navigable(site) == expected
     assert site.links.height == 3
-    assert "1 lines with railway=abandoned" in told(site)
-    assert "the site has none" in told(site)
+    assert "1 lines with railway=abandoned" in findings_text(site)
+    assert "the site has none" in findings_text(site)
 
 
 @pytest.mark.parametrize(("named", "relations"), [("railway_crossing", 0), ("switch", 4), (None, 0)])
@@ -93,7 +93,7 @@ def test_lines_that_cross_are_linked_only_where_the_survey_names_a_switch(
     lines = [way("a", (-300, 0), (0, 0), (300, 0)), way("b", (-300, -30), (0, 0), (300, 30))]
     site = site_of(written(tmp_path, "x.geojson", *lines, *([node(named, 0, 0)] if named else [])))
     assert len(navigable(site)) == relations
-    assert ("cross where neither ends" in told(site)) == (named is None)
+    assert ("cross where neither ends" in findings_text(site)) == (named is None)
 
 
 def test_two_that_meet_two_are_a_crossing_unless_named(tmp_path: Path) -> None:
@@ -120,12 +120,12 @@ def test_the_topology_of_a_real_network_comes_back_from_its_lines_alone(tmp_path
     assert navigable(site) == expected
 
 
-def test_doubtful_places_are_told(tmp_path: Path) -> None:
+def test_doubtful_places_are_reported(tmp_path: Path) -> None:
     kinked = way("kink", (0, 0), (100, 0), (105, 3), (200, 3))
     twice = way("twice", (0, 0.6), (99, 0.6), (198, 3.6))
     beside = way("beside", (150, 5.5), (160, 60))
     same = way("same", (100, 0), (105, 3))
-    text = told(site_of(written(tmp_path, "d.geojson", kinked, twice, beside, same)))
+    text = findings_text(site_of(written(tmp_path, "d.geojson", kinked, twice, beside, same)))
     assert "track: kink: 2 kinks" in text
     assert "track: twice: lies within 1.5 m of kink" in text or "track: kink: lies within 1.5 m of twice" in text
     assert "end 0 lies 2." in text
@@ -138,7 +138,7 @@ def test_trams_are_no_part_of_a_railway(tmp_path: Path) -> None:
     tram = way("way/2", (300, 0), (600, 0), kind="tram")
     site = site_of(written(tmp_path, "both.geojson", railway, tram))
     assert site.track["netelement_id"].unique().to_list() == ["way/1"]
-    assert "1 lines with railway=tram are left out: the railway beside them is another network" in told(site)
+    assert "1 lines with railway=tram are left out: the railway beside them is another network" in findings_text(site)
     alone = site_of(written(tmp_path, "tram.geojson", tram))
     assert alone.track["netelement_id"].unique().to_list() == ["way/2"]
 
@@ -165,8 +165,8 @@ def test_a_list_of_balises_has_names_and_kinds_in_german_and_says_what_it_lacks(
     listed.write_text("Breite;Länge\n50,005;14,0\n")
     site = site_of(line, balises=str(listed))
     assert site.balises.select("balise_id", "kind").rows() == [("B1", "virtual")]
-    assert "names them: numbered B1 to B1" in told(site)
-    assert "is their kind: all are taken as virtual" in told(site)
+    assert "names them: numbered B1 to B1" in findings_text(site)
+    assert "is their kind: all are taken as virtual" in findings_text(site)
 
 
 def track_csv(path: Path, east_m: np.ndarray, **columns: Any) -> Path:
@@ -175,21 +175,21 @@ def track_csv(path: Path, east_m: np.ndarray, **columns: Any) -> Path:
     return path
 
 
-def test_a_piece_that_is_missing_is_told_and_two_tracks_side_by_side_are_no_gap(tmp_path: Path) -> None:
+def test_a_missing_piece_is_reported_and_two_parallel_tracks_are_no_gap(tmp_path: Path) -> None:
     one, other = way("a", (0, 0), (500, 0)), way("b", (560, 0), (900, 0))
     beside = way("c", (0, 4.5), (500, 4.5))
     gaps = [
         line
-        for line in told(site_of(written(tmp_path, "g.geojson", one, other, beside))).splitlines()
+        for line in findings_text(site_of(written(tmp_path, "g.geojson", one, other, beside))).splitlines()
         if "apart and not linked" in line
     ]
     assert len(gaps) == 1
     assert "end 1 of a and end 0 of b are 60.00 m apart and not linked" in gaps[0]
 
 
-def test_a_line_over_itself_is_told(tmp_path: Path) -> None:
+def test_a_line_over_itself_is_reported(tmp_path: Path) -> None:
     again = written(tmp_path, "a.geojson", way("a", (0, 0), (500, 0), (500.5, 0.4), (0, 0.4)))
-    assert "track: a: lies within 1.5 m of itself" in told(site_of(again))
+    assert "track: a: lies within 1.5 m of itself" in findings_text(site_of(again))
 
 
 def test_a_kilometre_that_a_jump_skips_or_repeats_places_no_balise(tmp_path: Path) -> None:
@@ -328,7 +328,7 @@ def test_a_later_pass_goes_on_from_the_end_of_the_first() -> None:
     assert track["measure_m"].sum() == pytest.approx(1996.0, abs=0.5)
 
 
-def test_a_jump_of_the_reference_is_told_and_is_no_track(tmp_path: Path) -> None:
+def test_a_jump_of_the_reference_is_reported_and_is_no_track(tmp_path: Path) -> None:
     east = np.arange(0.0, 1000.0, 4.0)
     latitude, longitude = degrees(east, np.where((east >= 400) & (east < 420), 50.0, 0.0))
     times = pl.Series((np.arange(len(east)) * 200_000_000), dtype=pl.Int64).cast(pl.Datetime("ns", "UTC"))
@@ -340,7 +340,7 @@ def test_a_jump_of_the_reference_is_told_and_is_no_track(tmp_path: Path) -> None
         run / "reference.parquet"
     )
     site = site_of(run)
-    assert "run: 5 positions to which no train can have come are left out" in told(site)
+    assert "run: 5 positions to which no train can have come are left out" in findings_text(site)
     assert site.track["measure_m"].max() == pytest.approx(996.0, abs=0.1)
 
 
@@ -396,8 +396,8 @@ def test_what_is_no_survey_is_one_message(tmp_path: Path, name: str) -> None:
 
 def test_what_a_survey_is_taken_for_is_configuration(tmp_path: Path) -> None:
     bent = written(tmp_path, "bent.geojson", way("bent", (0, 0), (100, 0), (200, 15)))
-    assert "kinks" not in told(site_of(bent))
-    assert "track: bent: 1 kinks" in told(site_of(bent, config={"kink_deg": 5.0}))
+    assert "kinks" not in findings_text(site_of(bent))
+    assert "track: bent: 1 kinks" in findings_text(site_of(bent, config={"kink_deg": 5.0}))
     apart = written(tmp_path, "apart.geojson", way("a", (0, 0), (100, 0)), way("b", (100.5, 0), (200, 0)))
     assert navigable(site_of(apart)) == set()
     joined = {frozenset([("a", 1), ("b", 0)])}
@@ -474,7 +474,7 @@ def test_the_altitude_mode_of_a_multitrack_is_that_of_its_tracks(
 def test_a_crs_with_the_latitude_first_is_a_finding(tmp_path: Path) -> None:
     line = way("1", (0.0, 0.0), (500.0, 0.0))
     path = tmp_path / "line.geojson"
-    for name, told in {"urn:ogc:def:crs:EPSG::4326": True, "urn:ogc:def:crs:OGC:1.3:CRS84": False}.items():
+    for name, reported in {"urn:ogc:def:crs:EPSG::4326": True, "urn:ogc:def:crs:OGC:1.3:CRS84": False}.items():
         crs = {"type": "name", "properties": {"name": name}}
         path.write_text(json.dumps({"type": "FeatureCollection", "crs": crs, "features": [line]}))
-        assert any("latitude first" in finding.message for finding in site_of(path).findings) == told
+        assert any("latitude first" in finding.message for finding in site_of(path).findings) == reported

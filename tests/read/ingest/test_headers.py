@@ -92,7 +92,7 @@ def test_times_of_a_zone_that_is_not_known_are_asked_about(tmp_path: Path, name:
         ("Time (Europe/Warsaw)", "2025-06-03T06:00:00"),
     ],
 )
-def test_zones_that_are_told_for_certain(tmp_path: Path, name: str, first: str) -> None:
+def test_zones_that_are_certain(tmp_path: Path, name: str, first: str) -> None:
     text = f"{name},lat,lon\n" + "".join(f"{TIME.format(n)},50.1,14.2\n" for n in range(2))
     assert times_by_draft(tmp_path, text)[0] == first
 

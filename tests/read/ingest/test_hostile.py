@@ -106,10 +106,10 @@ def test_small_logs_cost_neither_seconds_nor_hundreds_of_megabytes(tmp_path: Pat
     done = subprocess.run(
         [sys.executable, "-c", _SCRIPT, good, *logs], check=True, capture_output=True, text=True, timeout=600
     )
-    told = [line.split("|") for line in done.stdout.splitlines()]
-    assert len(told) == len(logs)
-    assert [row for row in told if float(row[0]) > 4.0 or float(row[1]) > 300.0] == []
-    outcomes = {row[2]: row[3] for row in told}
+    measured = [line.split("|") for line in done.stdout.splitlines()]
+    assert len(measured) == len(logs)
+    assert [row for row in measured if float(row[0]) > 4.0 or float(row[1]) > 300.0] == []
+    outcomes = {row[2]: row[3] for row in measured}
     for name in ("repeated definitions", "records of no kind", "messages of nothing"):
         assert "a chunk unpacks to more records than the file has bytes" in outcomes[name]
     assert outcomes["empty chunks"] == "whole"

@@ -83,11 +83,11 @@ def test_it_still_finds_damage_in_what_it_covers(tmp_path):
         read(tmp_path, content[:start_of_chunk] + b"\1" + content[start_of_chunk + 1 :])
 
 
-@pytest.mark.parametrize("told_ns", [0, 1, 2])
-def test_a_first_time_of_zero_is_told_in_either_way(tmp_path, told_ns):
+@pytest.mark.parametrize("stated_ns", [0, 1, 2])
+def test_a_first_time_of_zero_is_taken_whether_or_not_the_log_says_so(tmp_path, stated_ns):
     data = MAGIC + header() + definitions() + b"".join(message(position(n), n) for n in range(3)) + data_end()
     counts = struct.pack("<IHQ", 10, 1, 3)
-    statistics = record(0x0B, struct.pack("<QHIIIIQQ", 3, 1, 1, 0, 0, 0, told_ns, 2) + counts)
+    statistics = record(0x0B, struct.pack("<QHIIIIQQ", 3, 1, 1, 0, 0, 0, stated_ns, 2) + counts)
     assert read(tmp_path, data + statistics + footer(len(data)) + MAGIC).gnss.height == 3
 
 

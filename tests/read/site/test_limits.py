@@ -70,7 +70,7 @@ A: Line = [(0.0, 0.0), (100.0, 0.0)]
 
 
 @pytest.mark.parametrize(
-    ("lines", "told", "key", "value"),
+    ("lines", "finding", "key", "value"),
     [
         ({"a": A, "b": [(100.0, 3.0), (200.0, 3.0)]}, "3.00 m apart and not linked", "near_ends_m", 2.0),
         ({"a": A, "b": [(200.0, 0.0), (300.0, 0.0)]}, "100.00 m apart and not linked", "facing_m", 50.0),
@@ -78,12 +78,12 @@ A: Line = [(0.0, 0.0), (100.0, 0.0)]
         ({"arc": ARC}, "leave the curve by 1.50 m", "chord_m", 2.0),
     ],
 )
-def test_a_limit_decides_whether_a_finding_is_told(
-    tmp_path: Path, lines: dict[str, Line], told: str, key: str, value: float
+def test_a_limit_decides_whether_a_finding_is_reported(
+    tmp_path: Path, lines: dict[str, Line], finding: str, key: str, value: float
 ) -> None:
     path = written(tmp_path, lines)
-    assert told in said(path)
-    assert told not in said(path, **{key: value})
+    assert finding in said(path)
+    assert finding not in said(path, **{key: value})
 
 
 def test_a_declared_length_may_differ_by_a_share(tmp_path: Path) -> None:

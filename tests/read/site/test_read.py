@@ -308,15 +308,15 @@ def test_a_relation_that_turns_back_is_not_navigable(tmp_path: Path) -> None:
     given = pl.concat([builders.links(), builders.links()[3:].with_columns(navigability=pl.lit("both"))])
     site = read_site(builders.write(tmp_path, track=builders.track(), links=given))
     assert site.links["navigability"].to_list() == ["both", "both", "AB", "none", "none"]
-    told = [finding.message for finding in site.findings if "by more than 90" in finding.message]
-    assert told == [
+    messages = [finding.message for finding in site.findings if "by more than 90" in finding.message]
+    assert messages == [
         "end 0 of b and end 0 of d are linked as navigable (both), but a train would have to turn by more than 90 "
         "degrees there: taken as not navigable"
     ]
 
 
 @pytest.mark.skipif(not INFRABEL.exists(), reason="the shared recordings are not beside the repository")
-def test_the_wrong_relation_of_the_recorded_network_is_told(tmp_path: Path) -> None:
+def test_the_wrong_relation_of_the_recorded_network_is_reported(tmp_path: Path) -> None:
     """The recorded network links the branches of one switch as `both` and as `none`."""
     folder = builders.write(tmp_path)
     (folder / "track.geojson").write_bytes((INFRABEL / "network_airport.geojson").read_bytes())
@@ -328,7 +328,7 @@ def test_the_wrong_relation_of_the_recorded_network_is_told(tmp_path: Path) -> N
 
 
 @pytest.mark.parametrize("address", ["nosuch://key:secret@bucket/site", "memory://key:secret@nowhere/site?X=secret"])
-def test_an_address_that_cannot_be_read_is_told_without_its_credentials(address: str) -> None:
+def test_an_address_that_cannot_be_read_is_shown_without_its_credentials(address: str) -> None:
     with pytest.raises(BaliseError) as caught:
         read_site(address)
     assert "secret" not in str(caught.value)

@@ -94,8 +94,8 @@ class TestHazards:
         one = found(t_hazard=[round(t * NS) for t in (200, 201, 900)], **alike)
         other = found(t_hazard=[round(t * NS) for t in (201, 203.5, 900)], **alike)
         _, changes = compare_hazards(one, other)
-        told = [(item.change, item.t_hazard[-7:]) for item in changes]
-        assert told == [
+        listed = [(item.change, item.t_hazard[-7:]) for item in changes]
+        assert listed == [
             ("vanished", "20.000Z"),
             ("appeared", "23.500Z"),
         ]
@@ -103,7 +103,7 @@ class TestHazards:
     def test_only_the_number_changed(self) -> None:
         assert self.changes(found(hazard_id=[0, 2, 1])) == [("changed", "VB_SHIFT")] * 2
 
-    def test_a_lost_column_is_told(self) -> None:
+    def test_a_lost_column_is_reported(self) -> None:
         schema, _ = compare_hazards(found(), found().drop("size_m"))
         assert [(item.kind, item.column) for item in schema] == [("schema", "size_m")]
         schema, changes = compare_hazards(found(), found().drop("t_hazard"))
@@ -179,9 +179,9 @@ class TestResults:
 
     def test_as_json(self, a: Path, tmp_path: Path) -> None:
         b = result(tmp_path / "b", tables(hazards=found(size_m=[51.0, 30.0, -25.0])), tables("r2"))
-        told = json.loads(json.dumps(diff_results(a, b).as_dict()))
-        assert (told["same"], told["compared"], told["only_in_b"]) == (False, 1, ["r2"])
-        (hazard,) = told["runs"][0]["hazards"]
+        answer = json.loads(json.dumps(diff_results(a, b).as_dict()))
+        assert (answer["same"], answer["compared"], answer["only_in_b"]) == (False, 1, ["r2"])
+        (hazard,) = answer["runs"][0]["hazards"]
         assert (hazard["change"], hazard["differences"][0]["column"]) == ("changed", "size_m")
 
     def test_not_a_result(self, a: Path, tmp_path: Path) -> None:
@@ -227,7 +227,7 @@ class TestRules:
             (["availability=0.0003"], ["epochs.hpl_m", "runs.epochs"], {"runs.availability"}),
         ],
     )
-    def test_columns_are_compared_as_told(
+    def test_columns_are_compared_by_the_rules(
         self, a: Path, b: Path, tolerances: list[str], ignored: list[str], left: set[str]
     ) -> None:
         compared = diff_results(a, b, rules_of(tolerances, ignored, None))
@@ -242,7 +242,7 @@ class TestRules:
         }
         assert diff_results(a, b, rules_of(["availability=0.01"], [], file)).same
 
-    def test_a_verdict_that_is_not_compared_is_not_told(self, a: Path, tmp_path: Path) -> None:
+    def test_a_verdict_that_is_not_compared_is_not_reported(self, a: Path, tmp_path: Path) -> None:
         unsafe = table(Runs, 1, solution="primary", status="ok", availability=0.9, verdict="unsafe")
         b = result(tmp_path / "b", tables(runs=unsafe))
         assert diff_results(a, b).runs[0].verdicts

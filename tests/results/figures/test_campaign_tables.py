@@ -262,15 +262,15 @@ class TestLevels:
             hazardous_max_s=pl.Series([1.0, None, None]),
         )
         found = campaign_levels(campaign_runs(catalogue, faults([]), CONFIG), CONFIG)
-        told = found.select("run_id", "service_level", "failures", "within", "exceeded", "verdict").rows()
-        assert told[:4] == [
+        shown = found.select("run_id", "service_level", "failures", "within", "exceeded", "verdict").rows()
+        assert shown[:4] == [
             ("a", "npa", 2, 2, 0, "kept"),
             ("a", "lpv200", 2, 0, 1, "exceeded"),
             ("a", "egnos_observed", 2, 1, 0, "unknown"),
             ("a", "horizontal_sis", 2, 2, 0, "kept"),
         ]
-        assert {row[5] for row in told[4:8]} == {"no_failure"}
-        assert {row[5] for row in told[8:]} == {"unknown"}
+        assert {row[5] for row in shown[4:8]} == {"no_failure"}
+        assert {row[5] for row in shown[8:]} == {"unknown"}
         assert found["hazardous_max_s"][:5].to_list() == [1.0] * 4 + [None]
         assert found["hazardous_may_max_s"][:5].to_list() == [3.0] * 4 + [None]
 
@@ -279,8 +279,8 @@ class TestLevels:
         catalogue = runs(["a", "b", "c"], gnss_rate_hz=[1.0, 10.0, None])
         wide = campaign_runs(catalogue, faults([]), CONFIG)
         found = campaign_levels(wide, CONFIG)
-        told = found.select("run_id", "service_level", "receiver_quick_enough").rows()
-        assert [row[2] for row in told] == [True, False, False, True] + [True] * 4 + [None] * 4
+        shown = found.select("run_id", "service_level", "receiver_quick_enough").rows()
+        assert [row[2] for row in shown] == [True, False, False, True] + [True] * 4 + [None] * 4
         assert found["receiver_needs_s"][0] == 2.0
         quick = campaign_levels(wide, Configuration.model_validate({"hazards": {"reaction_s": 0.1}}))
         assert quick["receiver_quick_enough"][:4].to_list() == [True, False, True, True]

@@ -36,14 +36,14 @@ def test_without_evidence_the_judged_counts_are_not_known_and_of_a_failed_run_no
 
 
 def test_outcome_of_a_run() -> None:
-    told = [
+    counted = [
         (found.hazards, found.missed_detections)
         for found in (
             outcome_of("r", "r", 0.0, rows, Hazards.create_empty(), Passages.create_empty())
             for rows in (ROWS, ROWS[1:2], ROWS[2:])
         )
     ]
-    assert told == [(1, 0), (None, None), (None, None)]
+    assert counted == [(1, 0), (None, None), (None, None)]
 
 
 def test_inspected_result(tmp_path: Path) -> None:

@@ -68,7 +68,7 @@ def test_a_stand_still_has_no_direction() -> None:
 def test_truth_is_the_reference_of_the_log(result: Result) -> None:
     """True positions come back from the tables to where the reference was, less the antenna's 2.5 m ahead.
 
-    Beside the track and in time they are not told apart, so only the fault's 1300 m would show.
+    Beside the track and in time they cannot be distinguished, so only the fault's 1300 m would show.
     """
     truth = positions_of(result.tables.epochs, result.site).truth
     assert result.log.reference is not None

@@ -160,9 +160,9 @@ def test_coordinates_of_a_plan(browser: Chrome, out: Path) -> None:
     before = browser.find_element("css selector", "#figure-s0-plan output").text
     browser.find_element("css selector", "#plot-s0-plan svg[data-drawn]").click()
     place = browser.find_element("css selector", "#figure-s0-plan .place")
-    told = place.find_element("css selector", "output").text
-    assert told != before
-    assert told.replace(", ", "/") in place.find_element("css selector", "a").get_attribute("href")
+    shown = place.find_element("css selector", "output").text
+    assert shown != before
+    assert shown.replace(", ", "/") in place.find_element("css selector", "a").get_attribute("href")
     assert [url for url in requested(browser) if not url.startswith(("data:", "file:"))] == []
 
 

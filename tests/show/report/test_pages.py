@@ -203,9 +203,9 @@ def test_headline_counts_faults_with_exact_bounds(out: Path) -> None:
     section = text[text.index('id="s1"') : text.index('id="architectures"')]
     assert "2 position failures in use, at a virtual balise or not: 1 in time, 1 too late" in section
     assert "No monitor found 1 of 3 faults with a failure that a truth judged" in section
-    told = {row[0]: row[1] for row in rows_of_table(text, "table-figures-s1")}
-    assert told["missed_share"] == "0.333 (95 %: 0.0084 to 0.906)"
-    assert (told["runs"], told["runs_failed"]) == ("3", "1")
+    shown = {row[0]: row[1] for row in rows_of_table(text, "table-figures-s1")}
+    assert shown["missed_share"] == "0.333 (95 %: 0.0084 to 0.906)"
+    assert (shown["runs"], shown["runs_failed"]) == ("3", "1")
 
 
 def test_allowed_times_of_every_level_are_drawn(out: Path) -> None:
@@ -269,9 +269,9 @@ def test_without_truth_no_health_is_claimed(replayed: dict[str, RunTables], tmp_
     assert {figures[name] for name in names} == {"not known"}
     assert '<div class="tile doubt"><dt>accepted at a wrong place</dt>' in run
     (row,) = rows_of_table(index, "table-runs")
-    told = dict(zip(RUN_COLUMNS, row, strict=True))
-    assert {told[name] for name in ("hazards", "missed_detections", "unsafe_accepted")} == {"–"}
-    assert told["balises_found"] != "–"
+    shown = dict(zip(RUN_COLUMNS, row, strict=True))
+    assert {shown[name] for name in ("hazards", "missed_detections", "unsafe_accepted")} == {"–"}
+    assert shown["balises_found"] != "–"
     assert dict(row[:2] for row in rows_of_table(index, "table-figures-s0"))["false_alarm_rate_per_h"] == "not known"
 
 
@@ -310,10 +310,10 @@ def test_the_same_result_gives_the_same_bytes(out: Path, site: Site) -> None:
 def test_only_pages_of_what_changed_are_made_again(replayed: dict[str, RunTables], tmp_path: Path) -> None:
     for run_id in ("kept", "cut", "changed"):
         write_run(RunTables(**{**vars(replayed["jump_two"]), "run_id": run_id}), tmp_path, {})
-    told: list[tuple[int, int]] = []
-    with watched(lambda done, total: told.append((done, total))):
+    progress: list[tuple[int, int]] = []
+    with watched(lambda done, total: progress.append((done, total))):
         write_report(tmp_path, jobs=2)
-    assert told == [(1, 3), (2, 3), (3, 3)]
+    assert progress == [(1, 3), (2, 3), (3, 3)]
     pages = {name: tmp_path / "report" / "runs" / f"{name}.html" for name in ("kept", "cut", "changed")}
     whole = pages["cut"].read_bytes()
     pages["cut"].write_bytes(whole[:-200])
@@ -424,9 +424,9 @@ def test_levels_stand_on_the_page_of_a_run(out: Path) -> None:
 
 def test_stanford_counts_stand_beside_the_figures(out: Path, replayed: dict[str, RunTables]) -> None:
     row = replayed["jump_two"].runs.row(0, named=True)
-    told = {one[0]: one[1] for one in rows_of_table(text_of(out, "runs/jump_two.html"), "table-all-s0")}
+    shown = {one[0]: one[1] for one in rows_of_table(text_of(out, "runs/jump_two.html"), "table-all-s0")}
     for name in [f"{prefix}_{kind}" for prefix in ("stanford", "stanford_hpl") for kind in STANFORD]:
-        assert int(told[name].replace("\u202f", "")) == row[name]
+        assert int(shown[name].replace("\u202f", "")) == row[name]
 
 
 def test_places_where_the_map_is_in_doubt(replayed: dict[str, RunTables], tmp_path: Path) -> None:

@@ -184,10 +184,10 @@ def test_the_files_of_a_run_are_named(report: Path) -> None:
 
 
 def test_the_figures_stand_beside_every_verdict(report: Path) -> None:
-    for page, told in (("runs/bad.html", "2 of 3 balises accepted, available for 25% of the moving time"),
+    for page, figures in (("runs/bad.html", "2 of 3 balises accepted, available for 25% of the moving time"),
                        ("runs/good.html", "1 of 1 balises accepted, availability not known (no odometer "),
                        ("index.html", "3 of 4 balises accepted, available for 25% of the moving time")):  # fmt: skip
-        assert told in (report / page).read_text().partition("<header>")[2].partition("<h1>")[0]
+        assert figures in (report / page).read_text().partition("<header>")[2].partition("<h1>")[0]
 
 
 def test_numbers_of_a_list_are_rounded_as_others_are() -> None:

@@ -72,17 +72,17 @@ def test_constant_speed_tells_no_latency_and_the_filter_knows_it():
 
 
 @pytest.mark.parametrize(
-    ("known", "told"),
+    ("known", "expected"),
     [
         ({"odometer_scale": 1.004, "odometer_scale_sigma": 2e-4}, {"odometer_scale": 1.004, "scale_sigma": 2e-4}),
         ({"gnss_latency_s": 0.08, "gnss_latency_sigma_s": 0.01}, {"latency_s": 0.08, "latency_sigma_s": 0.01}),
     ],
 )
-def test_what_the_vehicle_file_gives_alone_stays_and_the_other_is_learned(known, told):
+def test_what_the_vehicle_file_gives_alone_stays_and_the_other_is_learned(known, expected):
     aligned = align_run(*run(REAL, 1), Vehicle(**known), CONFIG)
     for column in ("odometer_scale", "scale_sigma", "latency_s", "latency_sigma_s"):
         found = aligned[column]
-        assert (found.min() == found.max() == told[column]) if column in told else (found[0] != found[-1])
+        assert (found.min() == found.max() == expected[column]) if column in expected else (found[0] != found[-1])
 
 
 def test_braking_after_a_long_cruise_raises_no_alarm():

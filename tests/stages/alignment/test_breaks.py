@@ -285,9 +285,9 @@ def test_a_position_has_settled_after_some_minutes():
 
 def test_a_position_far_beside_its_place_says_nothing_of_the_scale():
     learner, before, after = resumed(90.0, 12.0)
-    told, known = estimates_of(seen_at(learner, after, 12.0)), estimates_of(before.joint)
-    assert abs(told.scale - known.scale) < 0.5 * known.scale_sigma
-    assert told.scale_sigma > 0.95 * known.scale_sigma
+    updated, known = estimates_of(seen_at(learner, after, 12.0)), estimates_of(before.joint)
+    assert abs(updated.scale - known.scale) < 0.5 * known.scale_sigma
+    assert updated.scale_sigma > 0.95 * known.scale_sigma
 
 
 @pytest.mark.parametrize(("at_s", "speed_mps"), [(0.0, 10.0), (4.0, 15.0), (8.0, 40.0)])

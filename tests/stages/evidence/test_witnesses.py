@@ -166,6 +166,6 @@ def test_a_reference_shows_its_track_where_no_neighbour_can_have_made_it(
     of_reference = reference(ride, rng, sigma_m=sigma_m, aside_m=aside_m)
     config = Configuration.model_validate({"evidence": {"survey_complete": complete}})
     found = known(ground, odometer(ride, rng), of_reference=of_reference, config=config)
-    told = found.at(ns(np.arange(20.0, 380.0, 7.0)))
-    assert bool(told.on_survey.all()) is shown
-    assert bool(told.on_survey.any()) is shown
+    samples = found.at(ns(np.arange(20.0, 380.0, 7.0)))
+    assert bool(samples.on_survey.all()) is shown
+    assert bool(samples.on_survey.any()) is shown

@@ -54,12 +54,12 @@ def _failures(rung: Rung) -> list[str]:
     # Before a return nothing was in use: that time may count or not.
     before = np.concatenate([[False], at_most[:-1]])
     least, most = longest_s(rung, wrong & surely & before), float(rung.counted_s(wrong & at_most).sum())
-    told, failures = rung.row["hazardous_max_s"], rung.number("failures")
-    hazardous = 0.0 if told is None else rung.number("hazardous_max_s")
+    stated_s, failures = rung.row["hazardous_max_s"], rung.number("failures")
+    hazardous = 0.0 if stated_s is None else rung.number("hazardous_max_s")
     total = rung.row["hazardous_s"]
     found = []
     if hazardous < least - ROUNDING_S or hazardous > most + ROUNDING_S:
-        found.append(f"hazardous_max_s is {told}, judged wrong in use is {least:.3f} to {most:.3f} s")
+        found.append(f"hazardous_max_s is {stated_s}, judged wrong in use is {least:.3f} to {most:.3f} s")
     if isinstance(total, float) and not hazardous - ROUNDING_S <= total <= most + ROUNDING_S:
         found.append(f"hazardous_s is {total}, judged wrong in use is {hazardous:.3f} to {most:.3f} s")
     if (failures > 0) != (least > 0) and (failures > 0) != (most > 0):
@@ -72,8 +72,8 @@ def _share_p1(rung: Rung) -> list[str]:
     share, total = rung.row["share_p1"], rung.row["hazardous_s"]
     if share is None or total is None:
         return []
-    told = rung.number("share_p1") * rung.number("held_s")
-    return [] if abs(told - rung.number("hazardous_s")) < 1e-3 else [f"share_p1 is {told:.3f} s, hazardous_s {total}"]
+    p1_s = rung.number("share_p1") * rung.number("held_s")
+    return [] if abs(p1_s - rung.number("hazardous_s")) < 1e-3 else [f"share_p1 is {p1_s:.3f} s, hazardous_s {total}"]
 
 
 def _share_unknown(rung: Rung, surely: Bools, at_most: Bools) -> list[str]:
@@ -92,14 +92,14 @@ def _share_unknown(rung: Rung, surely: Bools, at_most: Bools) -> list[str]:
     if min(total) == 0:
         return []
     shares = [own_s / all_s for own_s, all_s in zip(found_s, total, strict=True)]
-    low, high, told = min(shares), max(shares), rung.row["share_unknown"]
+    low, high, share = min(shares), max(shares), rung.row["share_unknown"]
     # To which of its two epochs a span belongs is not fixed for a share: one epoch at each end and at each gap.
     period = float(np.median(np.diff(rung.epochs.time_s)))
     gaps = 2 + int((np.diff(rung.epochs.time_s) > 1.5 * period).sum())
     close = 0.005 + 1.5 * gaps * max(period, 1.0) / min(total)
-    if isinstance(told, float) and low - close <= told <= high + close:
+    if isinstance(share, float) and low - close <= share <= high + close:
         return []
-    return [f"share_unknown is {told}, the epochs say {low:.4f} to {high:.4f}"]
+    return [f"share_unknown is {share}, the epochs say {low:.4f} to {high:.4f}"]
 
 
 def _verdict(rung: Rung) -> list[str]:
@@ -140,4 +140,4 @@ def _states(rung: Rung) -> list[str]:
     state = rung.tables.epochs["lds_state"].cast(pl.String).fill_null("null").to_numpy().astype(str)
     judged = rung.epochs.judgement
     bad = ((state == "P0") & (judged != "right")) | ((state == "P1") & (judged != "wrong"))
-    return [rung.epochs.told(int(at), f"its state is {state[at]}") for at in np.flatnonzero(bad)[:3]]
+    return [rung.epochs.breach(int(at), f"its state is {state[at]}") for at in np.flatnonzero(bad)[:3]]

@@ -47,7 +47,7 @@ class Judgements:
     sure: Bools
     judgement: NDArray[np.str_]
 
-    def told(self, at: int, why: str) -> str:
+    def breach(self, at: int, why: str) -> str:
         return (
             f"{self.what} at {self.time_s[at]:.2f} s judged {self.judgement[at]}: {why} "
             f"(true error {self.error_m[at]:.2f} m, {'beside' if self.beside[at] else 'on'} the train's track)"
@@ -162,7 +162,7 @@ def _has(journey: Journey, name: str) -> bool:
 
 
 def findings(journey: Journey, rungs: dict[str, Rung], crooked: bool = False) -> list[str]:
-    """Every breach, told with rung, instant and true error.
+    """Every breach, with rung, instant and true error.
 
     `crooked`: the evidence itself errs, so that it need not decide; where its reference does, taking it away may help.
     """
@@ -200,14 +200,14 @@ def _right(rung: Rung, kind: Judgements) -> list[str]:
     """Never right where the truth is beyond the limit or on another track; never right by the odometer alone."""
     right = kind.judgement == "right"
     if rung.name == "odometer":
-        return [kind.told(at, "the odometer alone never says right") for at in _first(right)]
+        return [kind.breach(at, "the odometer alone never says right") for at in _first(right)]
     beyond = right & (np.abs(kind.error_m) > LIMIT_M + _margin_m(kind))
     beside = right & kind.beside & (kind.apart_m > APART_M)
     lost = right & np.isnan(kind.error_m)
     return [
-        *(kind.told(at, "it is beyond the limit") for at in _first(beyond)),
-        *(kind.told(at, "it is on another track") for at in _first(beside)),
-        *(kind.told(at, "it has no place") for at in _first(lost)),
+        *(kind.breach(at, "it is beyond the limit") for at in _first(beyond)),
+        *(kind.breach(at, "it is on another track") for at in _first(beside)),
+        *(kind.breach(at, "it has no place") for at in _first(lost)),
     ]
 
 
@@ -215,11 +215,11 @@ def _wrong(rung: Rung, kind: Judgements) -> list[str]:
     """Never wrong where the truth is within the limit on the train's own track, nor where the match is ambiguous."""
     within = (kind.judgement == "wrong") & (np.abs(kind.error_m) < LIMIT_M - _margin_m(kind))
     if rung.name == "odometer":
-        return [kind.told(at, "its anchor was right too") for at in _first(within & ~_shown(rung, kind))]
+        return [kind.breach(at, "its anchor was right too") for at in _first(within & ~_shown(rung, kind))]
     excused = kind.beside & kind.sure
     return [
-        *(kind.told(at, "it is within the limit") for at in _first(within & ~kind.beside)),
-        *(kind.told(at, "the match is ambiguous") for at in _first(within & kind.beside & ~excused)),
+        *(kind.breach(at, "it is within the limit") for at in _first(within & ~kind.beside)),
+        *(kind.breach(at, "the match is ambiguous") for at in _first(within & kind.beside & ~excused)),
     ]
 
 
@@ -253,9 +253,9 @@ def _intervals(rung: Rung) -> list[str]:
         return texts
     fast = (np.abs(kind.speed_mps) > TURNING_MPS) & ~kind.beside
     outside = fast & ((kind.error_m < low - MARGIN_M) | (kind.error_m > high + MARGIN_M))
-    texts += [kind.told(at, f"the interval is {low[at]:.2f} to {high[at]:.2f} m") for at in _first(outside)]
+    texts += [kind.breach(at, f"the interval is {low[at]:.2f} to {high[at]:.2f} m") for at in _first(outside)]
     off = fast & (np.abs(middle - kind.error_m) > 5.0 + MARGIN_M)
-    return texts + [kind.told(at, f"error_along_m is {middle[at]:.2f} m") for at in _first(off)]
+    return texts + [kind.breach(at, f"error_along_m is {middle[at]:.2f} m") for at in _first(off)]
 
 
 def _consistent(rung: Rung, low: Floats, high: Floats, middle: Floats) -> list[str]:
@@ -271,7 +271,7 @@ def _consistent(rung: Rung, low: Floats, high: Floats, middle: Floats) -> list[s
         "error_along_m is not known to 5 m": ~np.isnan(middle) & ~(high - low <= 10.0 + 1e-6),
         "the odometer alone gives no error_along_m": ~np.isnan(middle) & (rung.name == "odometer"),
     }
-    return [kind.told(at, text) for text, mask in rules.items() for at in _first(mask)]
+    return [kind.breach(at, text) for text, mask in rules.items() for at in _first(mask)]
 
 
 def _decided(rung: Rung) -> list[str]:
@@ -291,8 +291,8 @@ def _decided(rung: Rung) -> list[str]:
     beyond = covered & (np.abs(kind.error_m) > LIMIT_M + band) & (kind.judgement != "wrong")
     within = covered & alone & (np.abs(kind.error_m) < LIMIT_M - band) & (kind.judgement != "right")
     return [
-        *(kind.told(at, "the reference shows it beyond the limit") for at in _first(beyond)),
-        *(kind.told(at, "the reference shows it within the limit") for at in _first(within)),
+        *(kind.breach(at, "the reference shows it beyond the limit") for at in _first(beyond)),
+        *(kind.breach(at, "the reference shows it within the limit") for at in _first(within)),
     ]
 
 
@@ -325,5 +325,5 @@ def _pair(stronger: Rung, strong: Judgements, weaker: Rung, weak: Judgements) ->
             said, again = strong.judgement[other], weak.judgement[at]
             near = said == "unknown" and (switch[at] or abs(abs(weak.error_m[at]) - LIMIT_M) < band)
             if said != again and not near and not shown[at]:
-                found.append(weak.told(int(at), f"with {stronger.name} it is {said}"))
+                found.append(weak.breach(int(at), f"with {stronger.name} it is {said}"))
     return found[:3]

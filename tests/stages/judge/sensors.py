@@ -172,8 +172,8 @@ def odometer(rng: np.random.Generator, ride: Ride, of: Counter) -> pl.DataFrame:
     distance = np.cumsum(counted)
     time = _ticks(ride.length_s, of.rate_hz)
     rows = np.clip(np.round(time / tick_s).astype(int), 0, len(steps) - 1)
-    told = (counted - white)[rows] / tick_s
-    told += np.where(told != 0, of.noise_mps * rng.standard_normal(len(time)), 0.0)
+    speed_mps = (counted - white)[rows] / tick_s
+    speed_mps += np.where(speed_mps != 0, of.noise_mps * rng.standard_normal(len(time)), 0.0)
     none = np.zeros(len(time), bool)
     flags = np.any([slip.inside(time) & slip.flagged for slip in of.slips] or [none], axis=0)
     silent = np.any([slip.inside(time) & (slip.kind == "outage") for slip in of.slips] or [none], axis=0)
@@ -182,7 +182,7 @@ def odometer(rng: np.random.Generator, ride: Ride, of: Counter) -> pl.DataFrame:
             "t": stamps(time),
             "sensor": ["primary"] * len(time),
             "distance_m": of.polarity * distance[rows],
-            "speed_mps": of.polarity * told,
+            "speed_mps": of.polarity * speed_mps,
             "sigma_speed_mps": [None] * len(time),
             "slip": flags,
         }

@@ -35,7 +35,7 @@ def _true(world: str, name: str) -> Rung:
     return perfect(rung_of(journey, name, GONE[name]), 0.4 if name == "reference" else 4.0)
 
 
-def _told(rung: Rung) -> str:
+def _breaches_of(rung: Rung) -> str:
     return "\n".join(findings(rung.journey, {rung.name: rung}))
 
 
@@ -55,36 +55,40 @@ def test_the_truth_gives_no_findings(world: str) -> None:
 
 
 def test_a_wrong_position_called_right_is_found() -> None:
-    assert "is beyond the limit" in _told(_epochs(_true("step", "reference"), pl.lit("right").alias("judgement")))
+    assert "is beyond the limit" in _breaches_of(
+        _epochs(_true("step", "reference"), pl.lit("right").alias("judgement"))
+    )
 
 
 def test_a_right_position_called_wrong_is_found() -> None:
-    assert "it is within the limit" in _told(_epochs(_true("step", "reference"), pl.lit("wrong").alias("judgement")))
+    assert "it is within the limit" in _breaches_of(
+        _epochs(_true("step", "reference"), pl.lit("wrong").alias("judgement"))
+    )
 
 
 def test_another_track_called_right_is_found() -> None:
     assert _true("other_track", "reference").epochs.beside.sum() > 50, "no position is matched there: nothing is tested"
-    assert "is on another track" in _told(
+    assert "is on another track" in _breaches_of(
         _epochs(_true("other_track", "reference"), pl.lit("right").alias("judgement"))
     )
 
 
 def test_unknown_is_no_way_out() -> None:
-    told = _told(_epochs(_true("step", "reference"), pl.lit("unknown").alias("judgement")))
-    assert "the reference shows it beyond" in told
-    assert "the reference shows it within" in told
+    breaches = _breaches_of(_epochs(_true("step", "reference"), pl.lit("unknown").alias("judgement")))
+    assert "the reference shows it beyond" in breaches
+    assert "the reference shows it within" in breaches
 
 
 def test_an_interval_beside_the_truth_is_found() -> None:
     shifted = (pl.col("error_low_m") + 3.0, pl.col("error_high_m") + 3.0)
-    assert "the interval is" in _told(_epochs(_true("clean", "reference"), *shifted))
+    assert "the interval is" in _breaches_of(_epochs(_true("clean", "reference"), *shifted))
 
 
 def test_a_weaker_rung_that_knows_better_is_found() -> None:
     strong, weak = _true("step", "reference"), _true("step", "balise")
     flipped = pl.col("judgement").replace_strict({"right": "unknown", "wrong": "right", "unknown": "unknown"})
-    told = findings(strong.journey, {"reference": strong, "balise": _epochs(weak, flipped)})
-    assert any("balise against reference" in text for text in told)
+    breaches = findings(strong.journey, {"reference": strong, "balise": _epochs(weak, flipped)})
+    assert any("balise against reference" in text for text in breaches)
 
 
 @pytest.mark.parametrize(
@@ -100,10 +104,10 @@ def test_a_weaker_rung_that_knows_better_is_found() -> None:
 def test_a_sum_that_does_not_follow_is_found(column: str, value: object, text: str) -> None:
     rung = _true("late", "reference")
     assert rung.number("hazardous_max_s") > 2.0, "no failure in use: nothing is tested"
-    assert text in _told(_runs(rung, **{column: value}))
+    assert text in _breaches_of(_runs(rung, **{column: value}))
 
 
 def test_a_false_accusation_is_found() -> None:
     rung = _true("clean", "reference")
     assert np.abs(rung.epochs.error_m).max() < 19.0
-    assert "nothing was wrong by truth" in _told(_runs(rung, verdict="unsafe"))
+    assert "nothing was wrong by truth" in _breaches_of(_runs(rung, verdict="unsafe"))

@@ -139,7 +139,7 @@ def test_what_a_step_offers_on_its_way_lies_before_its_first_position() -> None:
 
 
 @pytest.mark.parametrize(
-    ("low_m", "high_m", "told", "verdict"),
+    ("low_m", "high_m", "judged", "verdict"),
     [
         ([-1.0, 4.0], [1.0, 9.0], [True, True], Verdict.UNKNOWN),  # 4 to 9 m against 5 m
         ([-1.0, 6.0], [1.0, 9.0], [False, False], Verdict.TRUE),
@@ -151,10 +151,10 @@ def test_what_a_step_offers_on_its_way_lies_before_its_first_position() -> None:
     ],
 )
 def test_an_alarm_is_false_only_where_all_of_its_positions_were_well(
-    low_m: list[float], high_m: list[float], told: list[bool], verdict: Verdict
+    low_m: list[float], high_m: list[float], judged: list[bool], verdict: Verdict
 ) -> None:
-    margin_m = np.full(len(told), 5.0)
-    assert verdict_within(np.array(low_m), np.array(high_m), margin_m, np.array(told, dtype=bool)) is verdict
+    margin_m = np.full(len(judged), 5.0)
+    assert verdict_within(np.array(low_m), np.array(high_m), margin_m, np.array(judged, dtype=bool)) is verdict
 
 
 def errors_across(fixes: pl.DataFrame, heading_deg: Any, at_s: list[float], reference: pl.DataFrame) -> list[Any]:
@@ -331,10 +331,10 @@ def test_who_is_suspected(
     kind: Evidence, error_m: float, stood: bool, counted_wrong: bool, sure: bool, suspect: Suspect
 ) -> None:
     """Ten epochs, of which the sixth tells; an alarm at 6 s. The odometer and the Doppler are silent."""
-    told = np.arange(10) == 5
+    at_fault = np.arange(10) == 5
     epochs = positions(
-        range(10), np.where(told, error_m, 0.0), 0.0, evidence=kind.value, odometer_stood=told & stood,
-        odometer_wrong=told & counted_wrong, gate_probability=np.where(~told | sure, 1.0, 0.5),
+        range(10), np.where(at_fault, error_m, 0.0), 0.0, evidence=kind.value, odometer_stood=at_fault & stood,
+        odometer_wrong=at_fault & counted_wrong, gate_probability=np.where(~at_fault | sure, 1.0, 0.5),
     )  # fmt: skip
     assert suspect_of(epochs, 6 * NS, 6 * NS, Configuration()) is suspect
     # What was before the time looked back on does not count.
@@ -388,9 +388,9 @@ def placed(path_m: list[float], element: int = 0) -> MatchedPositions:
 def test_each_alternative_is_weighed_however_few_instants_it_tells_of() -> None:
     """On element 0 the train is at 50 m; at 2 s it is there or at 90 m, and at 3 s the position is not known."""
     route = RoutePath(*(np.array([value]) for value in (0, True, 0.0, 0.0, 100.0)))
-    told = [Alternative(np.array(rows), route, np.array(low), np.array(low) + 2.0) for rows, low in (
+    alternatives = [Alternative(np.array(rows), route, np.array(low), np.array(low) + 2.0) for rows, low in (
         ([0, 1, 2, 3], [49.0] * 4), ([2], [89.0]), ([3], [89.0]))]  # fmt: skip
-    evidence = proving(np.full(4, KINDS.index(Evidence.BALISE)), tuple(told))
+    evidence = proving(np.full(4, KINDS.index(Evidence.BALISE)), tuple(alternatives))
     found = judge_positions(placed([50.0, 80.0, 50.0, np.nan]), evidence, [route], HazardConfig())
     assert found.code.tolist() == [RIGHT, WRONG, UNKNOWN, UNKNOWN]
     assert found.low_m == pytest.approx([-1.0, 29.0, -41.0, np.nan], nan_ok=True)
@@ -592,8 +592,8 @@ def test_where_the_evidence_ends_the_position_is_held_to_it_by_its_own_path(onwa
 
     at_m, leg, sure = np.array([110.0]), np.zeros(1, dtype=np.int64), np.ones(1, dtype=bool)
     given = MatchedPositions(np.array([1]), at_m - 100.0, leg, at_m, sure)
-    told = Alternative(np.array([0]), route(onward), np.array([95.0]), np.array([97.0]))
-    evidence = proving(np.array([KINDS.index(Evidence.BALISE)]), (told,))
+    end = Alternative(np.array([0]), route(onward), np.array([95.0]), np.array([97.0]))
+    evidence = proving(np.array([KINDS.index(Evidence.BALISE)]), (end,))
     found = judge_positions(given, evidence, [route([0, 1])], HazardConfig())
     assert found.code.tolist() == [code]
     assert found.wrong_track.tolist() == [code == WRONG]
@@ -617,8 +617,8 @@ def test_a_jump_is_what_gathers_within_a_second(
     error_m = np.array([0.0, 0.0, 0.0, 15.0, 30.0, 30.0, 30.0, 30.0, 0.0, 0.0])
     train_m, t_ns = 10.0 * np.arange(10), seconds(*(0.5 * np.arange(10)))
     unknown = np.full(10, np.nan)
-    told = (unknown, np.full(9, 10.0)) if by_odometer else (train_m, unknown[:9])
-    steps = steps_of(t_ns, train_m + error_m, *told, np.full(10, round(gap_s * NS)))
+    places = (unknown, np.full(9, 10.0)) if by_odometer else (train_m, unknown[:9])
+    steps = steps_of(t_ns, train_m + error_m, *places, np.full(10, round(gap_s * NS)))
     found = find_jumps(steps, np.full(10, direction), HazardConfig())
     assert [(one.first, one.last, one.step_m) for one in found] == jumps
 

@@ -174,7 +174,7 @@ def test_falling_path_mirrors_growing_path() -> None:
     ]
 
 
-def test_telegrams_of_balises_off_the_path_are_told() -> None:
+def test_telegrams_of_balises_off_the_path_are_reported() -> None:
     result = run(
         epochs_of(steps(0.0, 20.0, 10)),
         balises_at(PLACES, kind="physical"),
@@ -189,7 +189,7 @@ def test_without_a_reader_physical_balises_have_no_passages() -> None:
     assert result.passages.is_empty()
 
 
-def test_reader_goes_beside_the_position_and_both_are_told() -> None:
+def test_reader_goes_beside_the_position_and_both_are_reported() -> None:
     balises = balises_at(
         {"V1": 110.0, "P1": 110.0, "V2": 510.0, "P2": 510.0},
         kind=["virtual", "physical", "virtual", "physical"],

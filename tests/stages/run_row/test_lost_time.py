@@ -174,13 +174,13 @@ def test_a_verdict_names_its_cure(run: dict[str, Any], used: InUse, cure: list[R
 def test_clocks_that_leave_too_much_open_are_to_be_declared() -> None:
     """Of the 40 m that an error may span the clocks alone take 21 m: 0.7 s at 30 m/s."""
 
-    def told(run: dict[str, Any], open_m: float) -> list[Remedy]:
+    def remedies_for(run: dict[str, Any], open_m: float) -> list[Remedy]:
         return list(remedies(RUN | run, LostTime(), ALL_KNOWN, True, CONFIG, open_m))
 
     lacking = {"evidence": "balise", "reasons": ["unknown_in_use"]}
-    assert (told(lacking, 21.0), told(lacking, 19.0)) == ([Remedy.CLOCK], [])
-    assert told({"evidence": "balise", "reasons": ["not_diagnosed"]}, 21.0) == [], "nothing is unknown"
-    assert told({"evidence": "odometer", "reasons": ["unknown_in_use"]}, 21.0) == [Remedy.REFERENCE]
+    assert (remedies_for(lacking, 21.0), remedies_for(lacking, 19.0)) == ([Remedy.CLOCK], [])
+    assert remedies_for({"evidence": "balise", "reasons": ["not_diagnosed"]}, 21.0) == [], "nothing is unknown"
+    assert remedies_for({"evidence": "odometer", "reasons": ["unknown_in_use"]}, 21.0) == [Remedy.REFERENCE]
 
 
 def test_an_ambiguous_track_needs_a_route_and_a_survey_that_states_its_accuracy() -> None:

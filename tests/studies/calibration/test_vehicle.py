@@ -124,7 +124,7 @@ def test_rows_that_scatter_tell_no_latency_at_constant_speed(kind: str, size_m: 
 
 
 def test_counts_as_coarse_as_its_changes_of_speed_tell_no_latency() -> None:
-    """5 m at 10 Hz: a change of 5 m/s in 10 s is not told from the rhythm of the counts; the scale is."""
+    """5 m at 10 Hz: a change of 5 m/s in 10 s cannot be distinguished from the rhythm of the counts; the scale is."""
     t_s, path_m, track = simulated_run(0, 600)
     one = estimate_run(t_s, path_m, with_rows(track, "counts", 5.0, 50))
     assert one is not None

@@ -105,8 +105,8 @@ def test_ten_epochs_as_counts() -> None:
     }
     for key, (events, held_s, known_s, worst) in hand.items():
         counts = found[key]
-        told = (counts.events, counts.held_s, counts.known_s)
-        assert told == (events, held_s, known_s), key
+        counted = (counts.events, counts.held_s, counts.known_s)
+        assert counted == (events, held_s, known_s), key
         if key != ("mapu", "mainline"):
             assert counts.worst == worst, key
 
@@ -361,8 +361,8 @@ def test_latency_widens_the_safe_front_end() -> None:
     found = front([0.0, 1.0], run=run, latency_s=0.1)
     assert found.under_m == pytest.approx([8.0 + 1.236 + 2.0] * 2)
     assert found.over_m == pytest.approx([8.0] * 2)
-    told = front([0.0, 1.0], run=run | {"vehicle": "file"}, latency_s=0.1)
-    assert told.under_m == pytest.approx([8.0 + 1.236] * 2)
+    widened = front([0.0, 1.0], run=run | {"vehicle": "file"}, latency_s=0.1)
+    assert widened.under_m == pytest.approx([8.0 + 1.236] * 2)
 
 
 def test_speed_against_the_evidence() -> None:
@@ -541,7 +541,7 @@ def test_the_command(result: Path, capsys: pytest.CaptureFixture[str], monkeypat
     assert any(line.startswith("safe_front_end") and "not met" in line for line in lines)
     assert max(map(len, lines[1 : 1 + len(requirements(PROFILE))])) <= 80
     assert cli._guarded(["claim", str(result), "--json"], debug=False) == 0
-    told = json.loads(capsys.readouterr().out)
-    assert (told["profile"], told["version"], len(told["sources"])) == ("lu-2023", "1", 3)
-    assert len(told["requirements"]) == len(requirements(PROFILE))
+    answer = json.loads(capsys.readouterr().out)
+    assert (answer["profile"], answer["version"], len(answer["sources"])) == ("lu-2023", "1", 3)
+    assert len(answer["requirements"]) == len(requirements(PROFILE))
     assert cli._guarded(["claim", str(result), "--profile", "lu-2050"], debug=False) == 2

@@ -237,8 +237,8 @@ def test_few_satellites_are_named_where_a_run_tells_them(passes: pl.DataFrame, s
     """Every other run tells none: more than half of the lost passes must have few, of days one that tells is enough."""
     number = pl.col("run_id").str.slice(1).cast(pl.Int64) // 2
     cutting = pl.col("chainage").is_between(525.0, 675.0)
-    for told, cause in ((number % 3 < 2, "few_satellites"), (number % 3 < 1, "confidence")):
-        some = passes.with_columns(satellites=pl.when(told).then("satellites"))
+    for recorded, cause in ((number % 3 < 2, "few_satellites"), (number % 3 < 1, "confidence")):
+        some = passes.with_columns(satellites=pl.when(recorded).then("satellites"))
         assert set(classes(some, site).filter(cutting)["why"]) == {cause}
         by_day = classes(some, site, LineCriteria(independent="day", loss_limit=0.01)).filter(cutting)
         assert set(by_day["why"]) == {"few_satellites"}

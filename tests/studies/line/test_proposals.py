@@ -135,8 +135,8 @@ def test_windows_are_disjoint_on_each_way(found: LineResult, site: Site) -> None
 
 
 def test_stations_and_signals_are_served_where_they_can_be(found: LineResult) -> None:
-    told = found.proposals.row(by_predicate=pl.col("proposal") == "both-400m", named=True)
-    assert (told["points"], told["points_served"]) == (2, 1)
+    proposal = found.proposals.row(by_predicate=pl.col("proposal") == "both-400m", named=True)
+    assert (proposal["points"], proposal["points_served"]) == (2, 1)
     near = found.balises.filter((pl.col("near") == "S1") & (pl.col("kind") == "virtual"))
     assert near["measure_m"].is_between(1000.0, 1300.0).all()
 

@@ -76,7 +76,7 @@ def run() -> RunLog:
     ],
     ids=["exact", "7 decimals", "6 decimals", "minutes", "truncated", "thinned", "part"],
 )
-def test_a_copy_is_told(run: RunLog, change: Changed, said: str) -> None:
+def test_a_copy_is_reported(run: RunLog, change: Changed, said: str) -> None:
     gnss = _gnss(run)
     (found,) = _copies(gnss, change(_copied(gnss)))
     assert said in found

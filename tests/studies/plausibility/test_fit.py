@@ -1,4 +1,4 @@
-"""Wrong units, clocks, axes and shifts are told with their cause and lines that mend them; faulty runs do not fail."""
+"""Wrong units, clocks, axes and shifts are reported with their cause and a remedy; faulty runs do not fail."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from dataclasses import replace
 import polars as pl
 import pytest
 
-from benchmarks.truth.plausibility import applies, fit_of, told
+from benchmarks.truth.plausibility import applies, fit_of, is_reported
 from datasets.random_trials import random_trial
 from pipeline.one_run import replay as replayed
 from pipeline.read.ingest.correct import corrected
@@ -39,9 +39,9 @@ def trips() -> list[Trip]:
 
 
 @pytest.mark.parametrize("wrong", TRIED, ids=lambda wrong: wrong.name)
-def test_what_is_wrong_is_told_and_its_lines_mend_it(wrong: Wrong, trips: list[Trip]) -> None:
+def test_what_is_wrong_is_reported_and_its_lines_mend_it(wrong: Wrong, trips: list[Trip]) -> None:
     drawn = next(one for one in trips if applies(wrong, one))
-    assert told(wrong, drawn)[0], told(wrong, drawn)[1]
+    assert is_reported(wrong, drawn)[0], is_reported(wrong, drawn)[1]
     if wrong.vehicle or wrong.site:
         return
     changed = wrong.change(drawn.run)
@@ -55,7 +55,7 @@ def test_what_is_wrong_is_told_and_its_lines_mend_it(wrong: Wrong, trips: list[T
     assert mended.impossible == ()
 
 
-def test_nothing_is_told_of_healthy_trips(trips: list[Trip]) -> None:
+def test_nothing_is_reported_of_healthy_trips(trips: list[Trip]) -> None:
     for drawn in trips:
         found = fit_of(drawn.run, drawn.site)
         assert not isinstance(found, str)
@@ -210,7 +210,7 @@ def test_positions_are_never_moved_onto_the_survey(trips: list[Trip]) -> None:
     assert not check.lines
 
 
-def test_what_is_told_is_configuration(trips: list[Trip]) -> None:
+def test_what_is_reported_is_configuration(trips: list[Trip]) -> None:
     run, moved = trips[0].run, moved_site(24.0, 18.0)(trips[0].site)
     late = shifted(10.0, "odometer")(run)
     wide = PlausibilityConfig(reported_shift_m=60.0, lag_limit_s=12.0)
@@ -240,7 +240,7 @@ def test_a_counter_that_is_reset_is_no_wrong_sign(trips: list[Trip]) -> None:
         assert _fit(run.with_streams(odometer=turned)).impossible == ()
 
 
-def test_recorders_of_different_hours_are_told_with_lines(trips: list[Trip]) -> None:
+def test_recorders_of_different_hours_are_reported_with_lines(trips: list[Trip]) -> None:
     run = shifted(7200.0, "odometer")(trips[0].run)
     report = fit_report(run, Configuration())
     assert "does not overlap" in report.problems[0]

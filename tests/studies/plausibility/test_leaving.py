@@ -28,14 +28,14 @@ def against_survey(places: np.ndarray, surveyed: np.ndarray) -> Check:
 
 @pytest.mark.parametrize(("seed", "fifth"), [(0, 4), (5, 2), (6, 0), (8, 0)])
 def test_a_run_of_which_four_fifths_leave_the_network_tells_no_shift(seed: int, fifth: int) -> None:
-    """Each of these was told a shift of 1 to 4 km."""
+    """Each of these was reported as shifted by 1 to 4 km."""
     places = journey(seed)
     found = against_survey(places, places[fifth * 120 : (fifth + 1) * 120])
     assert not found.causes
 
 
 @pytest.mark.parametrize("seed", [0, 4, 6])
-def test_a_run_beside_the_network_by_one_shift_is_told_it(seed: int) -> None:
+def test_one_shift_of_a_run_off_the_network_is_reported(seed: int) -> None:
     places = journey(seed)
     noise = np.random.default_rng(seed).normal(0.0, 2.0, places.shape)
     found = against_survey(places + noise, places - np.array([131.0, 68.0]))

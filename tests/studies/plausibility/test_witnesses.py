@@ -22,7 +22,7 @@ def recorded() -> RunLog:
     return journey(gnss=GNSS, motion=MOTION)[0]
 
 
-def told(run: RunLog, vehicle: Vehicle | None = None) -> list[tuple[str, ...]]:
+def origin_rows(run: RunLog, vehicle: Vehicle | None = None) -> list[tuple[str, ...]]:
     return fit_report(run, CONFIG, vehicle=vehicle).tables[ODOMETERS].rows()
 
 
@@ -37,7 +37,7 @@ def told(run: RunLog, vehicle: Vehicle | None = None) -> list[tuple[str, ...]]:
     ],
 )
 def test_origin_declaration_and_use_of_an_odometer(origin, of_vehicle, expected) -> None:
-    (row,) = told(said(recorded(), origin), Vehicle(odometer_origin=of_vehicle))
+    (row,) = origin_rows(said(recorded(), origin), Vehicle(odometer_origin=of_vehicle))
     assert row[:3] == ("primary", *expected[:2])
     assert expected[2] in row[3]
 
@@ -46,7 +46,7 @@ def test_each_sensor_has_its_line_and_the_vehicle_file_speaks_of_the_first() -> 
     run = said(recorded(), None)
     assert run.odometer is not None
     both = pl.concat([run.odometer, run.odometer.with_columns(sensor=pl.lit("radar"))])
-    rows = told(run.with_streams(odometer=both), Vehicle(odometer_origin=Origin.WHEEL))
+    rows = origin_rows(run.with_streams(odometer=both), Vehicle(odometer_origin=Origin.WHEEL))
     assert [row[:3] for row in rows] == [("primary", "wheel", "the vehicle file"), ("radar", "unknown", "nobody")]
     assert "vehicle file" not in rows[1][3]
 

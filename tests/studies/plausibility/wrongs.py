@@ -16,14 +16,14 @@ Change = Callable[[RunLog], RunLog]
 
 @dataclass(frozen=True)
 class Wrong:
-    """`change` makes it; a check whose words hold all of `told` must say so; `fails`: it must be impossible.
+    """`change` makes it; a check whose words hold all of `reported` must say so; `fails`: it must be impossible.
 
     `needs`: stream columns that the run must have. `vehicle`, `site`: what the run is held against
     instead; `place`: where on earth.
     """
 
     name: str
-    told: tuple[str, ...]
+    reported: tuple[str, ...]
     change: Change = lambda run: run
     fails: bool = True
     needs: tuple[str, ...] = ()
@@ -197,19 +197,21 @@ def _velocities() -> list[Wrong]:
 def _clocks() -> list[Wrong]:
     found: list[Wrong] = []
     for name, by in _LAGS.items():
-        told = "GPS time" if name == "GPS time" else name
+        cause = "GPS time" if name == "GPS time" else name
         for sign in (1.0, -1.0):
             way = "later" if sign > 0 else "earlier"
             found.append(
                 Wrong(
                     f"odometer {way}: {name}",
-                    ("clock of the odometer", told),
+                    ("clock of the odometer", cause),
                     shifted(sign * by, _O),
                     speed_changes=True,
                 )
             )
         found.append(
-            Wrong(f"reference later: {name}", ("clock of the reference", told), shifted(by, _R), needs=("reference.t",))
+            Wrong(
+                f"reference later: {name}", ("clock of the reference", cause), shifted(by, _R), needs=("reference.t",)
+            )
         )
     found += [
         Wrong(

@@ -208,8 +208,8 @@ def test_a_recording_under_two_names_counts_once(tmp_path: Path) -> None:
     assert figures.select("runs", "hours_with_truth", "runs_unsafe").rows() == [(2, 2.0, 1)]
 
 
-@pytest.mark.parametrize(("digests", "told"), [(("x", "x"), False), (("x", "y"), True)])
-def test_runs_of_other_settings_are_told(digests: tuple[str, str], told: bool, tmp_path: Path) -> None:
+@pytest.mark.parametrize(("digests", "stated"), [(("x", "x"), False), (("x", "y"), True)])
+def test_runs_of_other_settings_are_stated(digests: tuple[str, str], stated: bool, tmp_path: Path) -> None:
     for run_id, digest in zip("ab", digests, strict=True):
         write_run(run_of(run_id, counted={"config_digest": digest, "input_digest": run_id}), tmp_path, {})
-    assert any("with 2 settings or vehicle files" in text for text in assess(tmp_path).statements) == told
+    assert any("with 2 settings or vehicle files" in text for text in assess(tmp_path).statements) == stated
