@@ -131,14 +131,14 @@ def independent(rng: Rng, truth: Journey, kind: str, fixes_s: Floats) -> pl.Data
     step_s = 1.0 / rng.choice([1.0, 2.0, 5.0, 10.0, 20.0, 50.0])
     own = np.arange(0.5, truth.t_s[-1] - 0.5, step_s)
     t_s = fixes_s if rng.random() < 0.5 else own + rng.uniform(0.0, 0.5) + 0.1 * step_s * rng.uniform(-1, 1, own.size)
-    seen_s = t_s - rng.uniform(0.0, 0.5)
-    way = np.interp(seen_s, truth.t_s, truth.way_m) * rng.uniform(0.98, 1.02)
+    sampled_s = t_s - rng.uniform(0.0, 0.5)
+    way = np.interp(sampled_s, truth.t_s, truth.way_m) * rng.uniform(0.98, 1.02)
     speed = np.gradient(np.interp(truth.t_s, truth.t_s, truth.way_m), _FINE_S)
     if rng.random() < 0.3:  # slip now and then
         begin = rng.uniform(0.0, truth.t_s[-1], 6)
         slip = np.any([(truth.t_s > b) & (truth.t_s < b + rng.uniform(2.0, 10.0)) for b in begin], axis=0)
         speed = speed * np.where(slip & (speed > 1.0), rng.uniform(1.02, 1.3), 1.0)
-        way = np.interp(seen_s, truth.t_s, np.cumsum(speed) * _FINE_S)
+        way = np.interp(sampled_s, truth.t_s, np.cumsum(speed) * _FINE_S)
     if kind == "pulses":
         pulse = rng.choice([0.02, 0.05, 0.1, 0.3, 0.5, 1.0])
         return odometer_frame(t_s, np.floor(way / pulse) * pulse, None)
@@ -147,14 +147,14 @@ def independent(rng: Rng, truth: Journey, kind: str, fixes_s: Floats) -> pl.Data
         return odometer_frame(t_s, way + walk, None)
     if kind == "digits":
         digit = rng.choice([0.1, 1.0]) / 3.6
-        return odometer_frame(t_s, None, np.round(_smooth(rng, speed, seen_s, truth) / digit) * digit)
+        return odometer_frame(t_s, None, np.round(_smooth(rng, speed, sampled_s, truth) / digit) * digit)
     noise = rng.uniform(0.02, 0.5) * _correlated(rng, t_s.size, rng.uniform(1.0, 30.0), float(np.median(np.diff(t_s))))
-    return odometer_frame(t_s, None, _smooth(rng, speed, seen_s, truth) + noise)
+    return odometer_frame(t_s, None, _smooth(rng, speed, sampled_s, truth) + noise)
 
 
-def _smooth(rng: Rng, speed: Floats, seen_s: Floats, truth: Journey) -> Floats:
+def _smooth(rng: Rng, speed: Floats, sampled_s: Floats, truth: Journey) -> Floats:
     window = int(rng.choice([0.1, 0.5, 1.0, 2.0]) / _FINE_S)
-    return np.asarray(np.interp(seen_s, truth.t_s, uniform_filter1d(speed, window)))
+    return np.asarray(np.interp(sampled_s, truth.t_s, uniform_filter1d(speed, window)))
 
 
 def copied(rng: Rng, truth: Journey, kind: str, t_s: Floats, places: Floats) -> pl.DataFrame:

@@ -22,7 +22,7 @@ RECORD = ".balise"
 
 @frozen
 class Opened:
-    """A project and its file; places that it names are told as seen from the working directory."""
+    """A project and its file; places that it names are resolved from the working directory."""
 
     file: Path
     project: Project

@@ -155,7 +155,7 @@ OF_THE_JUDGE = {
 }
 
 
-def seen(tables: RunTables, name: str, last: pl.DataFrame) -> pl.DataFrame:
+def complete_rows(tables: RunTables, name: str, last: pl.DataFrame) -> pl.DataFrame:
     """Rows that are complete at the last epochs of a cut log, without what the judge says of them."""
     frame: pl.DataFrame = getattr(tables, name)
     rows = frame.join(last, on="solution", how="left", maintain_order="left")
@@ -180,7 +180,7 @@ def test_what_comes_later_changes_nothing_that_was_before(seed: int) -> None:
         part = replay(cut(made.run, float(cut_s)), SITE, made.vehicle, made.config)
         last = part.epochs.group_by("solution").agg(last=pl.col("t").max())
         for name in ("epochs", "passages", "alarms"):
-            found, expected = seen(part, name, last), seen(whole, name, last)
+            found, expected = complete_rows(part, name, last), complete_rows(whole, name, last)
             if name == "passages":
                 found, expected = unsettled(found), unsettled(expected)
             assert_frame_equal(found, expected, check_exact=True)

@@ -97,7 +97,7 @@ def test_rows_without_a_position_change_no_time_in_use(every: int, driven: bool)
 
 @pytest.mark.parametrize("step", [9, 12, 20])
 def test_unknown_time_of_a_thinned_log_counts(step: int):
-    """After 60 s the reference ends and few positions are left, which drift away unseen."""
+    """After 60 s the reference ends and few positions are left, which drift away undetected."""
     kept = pl.Series((TIME_S < 60.0) | (np.arange(TIME_S.size) % step == 0))
     log = gnss(np.clip(TIME_S - 65.0, 0.0, 60.0)).filter(kept)
     found = row(replay(RunLog("thin", log, reference=reference(slice(0, 600))), SITE))
@@ -254,8 +254,8 @@ def test_a_fault_behind_a_gap_may_be_as_old_as_the_gap(gap_s: float):
     assert (row(tables)["verdict"] == "unsafe") == (gap_s > 0.3)
 
 
-@pytest.mark.parametrize(("rate_mps", "seen_s"), [(0.5, 110.0), (3.0, 50.1)])
-def test_a_drift_has_its_time_from_failure_to_detection(rate_mps: float, seen_s: float):
+@pytest.mark.parametrize(("rate_mps", "detected_s"), [(0.5, 110.0), (3.0, 50.1)])
+def test_a_drift_has_its_time_from_failure_to_detection(rate_mps: float, detected_s: float):
     """Off from 50 s on, no average looks on: a slow one is seen at a jump; T_dsf is given as an interval."""
     drift = np.clip(rate_mps * (TIME_S - 50.0), 0.0, None)
     jump = np.where(TIME_S >= 110.0, 60.0, 0.0)
@@ -267,8 +267,8 @@ def test_a_drift_has_its_time_from_failure_to_detection(rate_mps: float, seen_s:
     # Beyond 20 m at 50 s + 20 m / rate; certain or possible so much later or earlier: 3 sigma of the reference, and at
     # one speed the clock is assumed, 0.1 s.
     half_m = 3.0 * 1.0 + 0.1 * 30.0
-    assert least_s == pytest.approx(seen_s - 50.0 - (20.0 + half_m) / rate_mps, abs=1.0)
-    assert most_s == pytest.approx(seen_s - 50.0 - (20.0 - half_m) / rate_mps, abs=1.5)
+    assert least_s == pytest.approx(detected_s - 50.0 - (20.0 + half_m) / rate_mps, abs=1.0)
+    assert most_s == pytest.approx(detected_s - 50.0 - (20.0 - half_m) / rate_mps, abs=1.5)
 
 
 @pytest.mark.parametrize("driven", [True, False], ids=["odometer", "no_odometer"])

@@ -169,7 +169,7 @@ def parallel_findings(site: Site, config: Configuration = _WHOLE) -> list[Findin
 
 
 class TrackResolution(NamedTuple):
-    """Per net element how far aside another track has to lie to be told from it with exact positions [m]."""
+    """Per net element how far aside another track has to lie to be distinguished from it with exact positions [m]."""
 
     survey_m: Floats
     by_offset_m: Floats

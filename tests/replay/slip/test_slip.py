@@ -79,8 +79,8 @@ def test_a_fault_right_after_slip_is_found_at_once(after_s: float) -> None:
     tables = replayed(Slip(0.08), Fault(SECOND_START_S + 12.1 + after_s, 25.0))
     # Two starts leave more in doubt than a re-link may explain.
     assert accepted(tables) == ["V0", "V1", "V2", "V3"]
-    seen_s = (tables.alarms["t_start"][0] - tables.epochs["t"][0]).total_seconds()
-    assert seen_s == pytest.approx(SECOND_START_S + 12.1 + after_s, abs=0.15)
+    detected_s = (tables.alarms["t_start"][0] - tables.epochs["t"][0]).total_seconds()
+    assert detected_s == pytest.approx(SECOND_START_S + 12.1 + after_s, abs=0.15)
 
 
 def test_after_too_much_slip_only_a_telegram_links_again() -> None:

@@ -124,14 +124,14 @@ def test_a_step_leaves_both_sides_open_where_no_read_confirms(
 
 
 @pytest.mark.parametrize("begun_s", [20.0, 80.0, 130.0])
-def test_a_drift_is_seen_wherever_long_windows_begin(begun_s: float) -> None:
+def test_a_drift_shows_wherever_long_windows_begin(begun_s: float) -> None:
     """11 m off within 40 s at sigma 0.4 m: 5.33 roots of two samples are 3 m, not reached in 10 s, and with 5 m 8 m."""
     t_s = np.arange(0.0, 260.0, 0.5)
     drift_m = 11.0 * np.clip((t_s - begun_s) / 40.0, 0.0, 1.0)
     sigma_m = np.full(t_s.size, 0.4)
-    seen = replace(stretch(t_s, 20.0 * t_s + drift_m), sigma_m=sigma_m)
+    drifting = replace(stretch(t_s, 20.0 * t_s + drift_m), sigma_m=sigma_m)
     witness = Witness(counter(20.0 * np.arange(0.0, 261.0, 0.5), 2.0))
-    found = known_stretch(Sided(seen, 1, 1.0, 0.0), SURE, (witness,), [], 0.0, CONFIG)
+    found = known_stretch(Sided(drifting, 1, 1.0, 0.0), SURE, (witness,), [], 0.0, CONFIG)
     assert found.levels.doubts == 1
     honest = replace(stretch(t_s, 20.0 * t_s), sigma_m=sigma_m)
     assert known_stretch(Sided(honest, 1, 1.0, 0.0), SURE, (witness,), [], 0.0, CONFIG).levels.doubts == 0

@@ -98,8 +98,10 @@ def drifting(begin_s: float, end_s: float, rate_mps: float, speeds: tuple[list[f
     way_m = np.cumsum(np.interp(t_s, *speeds)) * 0.05
     place_m = way_m + rate_mps * np.clip(t_s - begin_s, 0.0, end_s - begin_s)
     at_s = np.arange(2.0, t_s[-1] - 2.0, 2.0)
-    seen_m = np.interp(at_s, t_s, place_m) + np.random.default_rng(4).normal(0.0, 0.1, at_s.size)
-    return scale_and_lag(at_s[:-5], at_s[5:], seen_m[5:] - seen_m[:-5], CounterRows(t_s, way_m, np.zeros(t_s.size)))
+    measured_m = np.interp(at_s, t_s, place_m) + np.random.default_rng(4).normal(0.0, 0.1, at_s.size)
+    return scale_and_lag(
+        at_s[:-5], at_s[5:], measured_m[5:] - measured_m[:-5], CounterRows(t_s, way_m, np.zeros(t_s.size))
+    )
 
 
 def test_a_drift_as_long_as_the_only_change_of_speed_is_no_lag() -> None:
