@@ -113,7 +113,9 @@ class LinePieces(dy.Schema):
     few_satellites = count("passes lost where the receiver used few satellites, whatever their cause")
     claimed_wrongly = count("passes on which a wrong position in use claimed this piece; the train was elsewhere")
     unknown = count("further passes that the evidence could not judge")
-    unjudged = count("of these in runs with a reference, which should have shown it: each upper bound counts them as lost")
+    unjudged = count(
+        "of these in runs with a reference, which should have shown it: each upper bound counts them as lost"
+    )
     after_alarm = count("further passes without use because of an alarm before the piece")
     loss_share = real("1", "lost or wrong passes of those judged", min=0)
     loss_low = real("1", "exact lower bound (Clopper-Pearson); 0 where nothing was judged", min=0)
