@@ -166,9 +166,9 @@ class LineBalises(dy.Schema):
     direction = one_of(BaliseDirection, "in which direction along its net element it is valid")
     why = text("of a physical one: class and cause of the piece, per direction of travel over its net element")
     near = text("station or signal that it serves; empty where none")
-    distance_m = real("m", "way from the balise before; null for the first", min=0)
-    odometer_confidence_m = real("m", "confidence of the odometer there, 5 m + 5 % of this way", min=0)
-    largest_undetected_m = real("m", "largest undetected error seen on the way; null where not in the tables", min=0)
+    distance_m = real("m", "distance from the balise before; null for the first", min=0)
+    odometer_confidence_m = real("m", "confidence of the odometer there, 5 m + 5 % of this distance", min=0)
+    largest_undetected_m = real("m", "largest undetected error over this distance; null where not in the tables", min=0)
     proved = flag("suitable in every direction of travel, not just in those that were run")
 
 

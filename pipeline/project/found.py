@@ -63,36 +63,36 @@ def look_around(folder: Path) -> Found:
 
 def _walk(folder: Path) -> Iterator[Path]:
     """Regular files, and folders that are one thing, each once: by its own name rather than by that of a link."""
-    seen = {os.path.realpath(folder)}
+    visited = {os.path.realpath(folder)}
     links: list[Path] = []
-    yield from _inside(folder, seen, links)
+    yield from _inside(folder, visited, links)
     while links:
         link = links.pop(0)
-        if _is_new(link, seen):
-            yield from _at(link, seen, links)
+        if _is_new(link, visited):
+            yield from _at(link, visited, links)
 
 
-def _inside(folder: Path, seen: set[str], links: list[Path]) -> Iterator[Path]:
+def _inside(folder: Path, visited: set[str], links: list[Path]) -> Iterator[Path]:
     for path in sorted(folder.iterdir()):
         if path.is_symlink():
             links.append(path)
-        elif _is_new(path, seen):
-            yield from _at(path, seen, links)
+        elif _is_new(path, visited):
+            yield from _at(path, visited, links)
 
 
-def _is_new(path: Path, seen: set[str]) -> bool:
+def _is_new(path: Path, visited: set[str]) -> bool:
     real = os.path.realpath(path)
-    is_new = real not in seen
-    seen.add(real)
+    is_new = real not in visited
+    visited.add(real)
     return is_new
 
 
-def _at(path: Path, seen: set[str], links: list[Path]) -> Iterator[Path]:
+def _at(path: Path, visited: set[str], links: list[Path]) -> Iterator[Path]:
     if path.name.startswith(".") or path.name == FILE_NAME or (path / "manifest.json").is_file():
         return
     require_name(path)
     if path.is_dir() and not is_site(path) and not is_one_log(path):
-        yield from _inside(path, seen, links)
+        yield from _inside(path, visited, links)
     elif path.is_dir() or (path.is_file() and path.suffix.lower() not in _COMPANION_SUFFIXES):
         yield path
 

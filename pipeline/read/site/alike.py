@@ -104,12 +104,12 @@ def _ahead(
 
     def on_chain(chain: Chain) -> tuple[_OnChain, ...]:
         entered = zip(chain.oriented, chain.entry_m, strict=True)
-        on_way = (
+        ahead = (
             (point, entry_m + point.at_m)
             for number, (here, entry_m) in enumerate(entered)
             for point in points.get(here, [])[0 if number else index + 1 :]
         )
-        return tuple(islice(on_way, 2))
+        return tuple(islice(ahead, 2))
 
     def onward(chain: Chain) -> list[Edge]:
         return [edge for edge in network.successors[chain.oriented[-1]] if edge.forward and len(on_chain(chain)) < 2]

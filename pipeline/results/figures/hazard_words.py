@@ -79,7 +79,7 @@ def _phrase(row: Row, wrong: Row | None) -> str:
     not as the fault at its largest.
     """
     what = f"{_hit(row)}, {_accepted(row)}" if wrong is None else _wrongly_accepted(row, wrong)
-    return f"{row['hazard']}: {what}; {_seen(row)}{_in_use(row)}"
+    return f"{row['hazard']}: {what}; {_detection(row)}{_in_use(row)}"
 
 
 def _wrongly_accepted(row: Row, wrong: Row) -> str:
@@ -112,7 +112,7 @@ def _accepted(row: Row) -> str:
     return _say("accepted") if set(accepted) == set(hit) else f"{_some(accepted)} {_say('accepted')}"
 
 
-def _seen(row: Row) -> str:
+def _detection(row: Row) -> str:
     """Which monitor saw it, and how late; a drift against its failure, since its onset may be the alarm itself."""
     if not row["detected"]:
         return _say("unseen")

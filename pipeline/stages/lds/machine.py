@@ -175,7 +175,7 @@ class LocationSystem:
         self.withheld_for: list[LostTo | None] = [None] * journey.t_ns.size
         # The walk reads single elements: lists are several times faster at that than arrays.
         self._t_ns: list[int] = journey.t_ns.tolist()
-        self._way_m = journey.odometer_m * journey.direction
+        self._travelled_m = journey.odometer_m * journey.direction
         self._unwatched = unwatched_epochs(journey, bank.watched, config.align.gap_reset_s)
         self._bridged_ns = round(config.align.gap_reset_s * NS_PER_S)
         self._missions = mission_epochs(journey, config.lds)
@@ -229,7 +229,7 @@ class LocationSystem:
 
     def _first_closing(self, epoch: int, end: int) -> int:
         """The first epoch before `end` at which the window of a balise closes."""
-        closing = self._way_m[epoch:end] > self.balises.closing_m
+        closing = self._travelled_m[epoch:end] > self.balises.closing_m
         return epoch + int(closing.argmax()) if closing.any() else end
 
     def _pass_uneventful(self, epoch: int, end: int) -> None:

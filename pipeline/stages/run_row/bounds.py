@@ -166,9 +166,9 @@ def missed_detection() -> pl.Expr:
 
 
 def since_when_at_most() -> pl.Expr:
-    """The earliest begin of a failure that the evidence leaves; null where it is silent for one that failed."""
-    silent = pl.col("t_failure").is_not_null() & pl.col("t_failure_may").is_null()
-    return pl.when(~silent.any()).then(pl.col("t_failure_may").min())
+    """The earliest begin of a failure that the evidence leaves; null where there is none for one that failed."""
+    without_evidence = pl.col("t_failure").is_not_null() & pl.col("t_failure_may").is_null()
+    return pl.when(~without_evidence.any()).then(pl.col("t_failure_may").min())
 
 
 def independent_episodes(hazards: pl.DataFrame) -> pl.DataFrame:
