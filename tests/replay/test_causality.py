@@ -48,7 +48,7 @@ class World:
     config: Configuration
 
 
-def way_m(dice: np.random.Generator) -> tuple[Floats, Floats]:
+def chainage_m(dice: np.random.Generator) -> tuple[Floats, Floats]:
     """Times and places: stretches at random speeds with stands between them."""
     t_s = np.arange(0.0, LASTS_S, 0.05)
     knots_s = np.sort(dice.uniform(0.0, LASTS_S, 8))
@@ -121,7 +121,7 @@ def odometer_of(dice: np.random.Generator, name: str, t_s: Floats, place_m: Floa
 
 def world(seed: int) -> World:
     dice = np.random.default_rng(seed)
-    t_s, place_m = way_m(dice)
+    t_s, place_m = chainage_m(dice)
     solutions = [gnss_of(dice, name, t_s, place_m) for name in ("primary", "other")]
     sensors = [odometer_of(dice, name, t_s, place_m) for name in ("primary", "second")[: dice.integers(1, 3)]]
     passed = [(f"P{k}", float(np.interp(2_500.0 * k, place_m, t_s))) for k in range(1, 5) if place_m[-1] > 2_500.0 * k]

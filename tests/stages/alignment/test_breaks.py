@@ -296,6 +296,6 @@ def test_the_speed_is_centred_but_where_the_odometer_ends(at_s, speed_mps):
     odometry = odometry_from(odometer_of([0.0, 2.0, 4.0, 6.0, 8.0], distance_m=[0.0, 20.0, 40.0, 80.0, 160.0]))
     odometry = replace(odometry, t_s=np.arange(0.0, 9.0, 2.0), distance_m=np.array([0.0, 20.0, 40.0, 80.0, 160.0]))
     learner = ScaleLatencyFilter(*error_model(CONFIG.monitors), odometry, CONFIG.align)
-    way_m, found_mps = learner._odometer_at(at_s, 0.0)
-    assert way_m == np.interp(at_s, odometry.t_s, odometry.distance_m)
+    travelled_m, found_mps = learner._odometer_at(at_s, 0.0)
+    assert travelled_m == np.interp(at_s, odometry.t_s, odometry.distance_m)
     assert found_mps == pytest.approx(speed_mps)

@@ -74,10 +74,10 @@ def no_gaps(begin: TrueAnchor, end: TrueAnchor) -> list[float]:
 def test_seventy_seconds_of_changing_speed_tell_a_lag() -> None:
     """Seven ways of ten seconds, and six are enough; the odometer stamps 0.4 s earlier."""
     fine_s = np.arange(0.0, 73.0, 0.01)
-    way_m = np.cumsum(np.interp(fine_s, [0, 12, 24, 36, 48, 60, 72], [4, 28, 6, 30, 8, 26, 4])) * 0.01
+    travelled_m = np.cumsum(np.interp(fine_s, [0, 12, 24, 36, 48, 60, 72], [4, 28, 6, 30, 8, 26, 4])) * 0.01
     t_s = np.arange(0.0, 71.0, 0.1)
-    late = stretch(t_s + 0.4, np.interp(t_s, fine_s, way_m))
-    counted = counter(np.interp(np.arange(0.0, 72.0, 0.1), fine_s, way_m), 10.0)
+    late = stretch(t_s + 0.4, np.interp(t_s, fine_s, travelled_m))
+    counted = counter(np.interp(np.arange(0.0, 72.0, 0.1), fine_s, travelled_m), 10.0)
     (found,) = lags_of(*reference_movements([Sided(late, 1, 1.0, 0.0)], no_gaps), counted, CONFIG).found
     assert found.lag_s == pytest.approx(0.4, abs=0.03)
     assert found.lag_sigma_s < 0.05

@@ -128,27 +128,29 @@ def test_a_fault_after_a_fix_between_two_rows_has_only_the_time_since() -> None:
 
 def test_starts_that_were_not_tried_leave_no_shorter_spacing() -> None:
     monitored = watched(rows(np.random.default_rng(1), 60))
-    limit_m, way_m = 8.0, 10.0 * monitored.t_s
+    limit_m, travelled_m = 8.0, 10.0 * monitored.t_s
     settings = {
         "hazards": {"failure_limit_m": limit_m, "jump_limit_m": limit_m},
         "undetected": {"spacing_step_s": 50.0, "spacing_resolution_s": 0.0},
     }
-    found, before_m = largest_spacing(monitored, way_m, Configuration.model_validate(settings))
+    found, before_m = largest_spacing(monitored, travelled_m, Configuration.model_validate(settings))
     ways, grow = [], partial(growth_with, splits=splits_anywhere(monitored))
     both = (monitored, monitored.mirrored())
     for start in range(59):
         most = np.maximum(*(bounds(one.since(start, 59), grow=grow).most_m for one in both))
         beyond = np.append(np.flatnonzero(most > limit_m), most.size)[0]
         if beyond < most.size:
-            ways.append(way_m[start + beyond] - way_m[start])
+            ways.append(travelled_m[start + beyond] - travelled_m[start])
             # From here on a balise at the start was too far before.
-            assert (before_m[start + 1 + beyond :] < way_m[start + 1 + beyond :] - way_m[start] + 1e-9).all()
+            assert (
+                before_m[start + 1 + beyond :] < travelled_m[start + 1 + beyond :] - travelled_m[start] + 1e-9
+            ).all()
     assert min(ways) > 100.0
     assert found.distance_m is not None
     assert 0.9 * min(ways) - 1e-9 <= found.distance_m <= min(ways) + 1e-9
     assert found.time_s == pytest.approx(found.distance_m / 10.0, abs=1e-9)
     settings["undetected"]["spacing_close_share"] = 0.999
-    coarse, _ = largest_spacing(monitored, way_m, Configuration.model_validate(settings))
+    coarse, _ = largest_spacing(monitored, travelled_m, Configuration.model_validate(settings))
     assert coarse.distance_m is not None
     assert coarse.distance_m < 0.9 * min(ways)
 
