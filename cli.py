@@ -744,7 +744,7 @@ def experiment(
 def sql(
     out: Result,
     query: Annotated[str, Argument(help="One SELECT, SHOW TABLES, or DESCRIBE table.")],
-    beside: Annotated[
+    compared: Annotated[
         list[str] | None,
         Option("--with", metavar="NAME=OUT", help="Another result; its tables are NAME_runs, NAME_hazards, ..."),
     ] = None,
@@ -763,7 +763,7 @@ def sql(
     from pipeline.results.answer_files import write_answer
     from pipeline.results.query import named_results, run_sql
 
-    answer = run_sql(out, query, allow_files, named_results(beside or []))
+    answer = run_sql(out, query, allow_files, named_results(compared or []))
     written = write_answer(answer, csv, parquet, xlsx, file, guard)
     for name in written:
         _say(f"{answer.height} rows in {name}")

@@ -210,7 +210,7 @@ def _figures_schema() -> type[dy.Schema]:
         ),
         "physical_spacing_runs": count("runs with a spacing of physical balises computed"),
         "physical_spacing_m": real(
-            "m", "shortest way from a physical balise at any time to one beyond the limit", min=0
+            "m", "least distance from a physical balise at any time to one beyond the limit", min=0
         ),
         "physical_spacing_median_m": real("m", "median over the runs that reach the limit", min=0),
         "physical_spacing_share_low": real(

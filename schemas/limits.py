@@ -46,7 +46,7 @@ class Limits(NamedTuple):
     moved_m: float
     """F. So far a position may have moved over an outage or a break: the odometer's scale is learned anew behind it."""
     abreast_m: float
-    """F. Errors across the track and in height are told where the reference is no further along it."""
+    """F. Errors across the track and in height are stated where the reference is no further along it."""
     span_m: float
     """2 F. A part of the line whose place is known less closely is unknown: the whole room of a right position."""
     clock_open_m: float

@@ -113,7 +113,9 @@ class LinePieces(dy.Schema):
     few_satellites = count("passes lost where the receiver used few satellites, whatever their cause")
     claimed_wrongly = count("passes on which a wrong position in use claimed this piece; the train was elsewhere")
     unknown = count("further passes that the evidence could not judge")
-    unjudged = count("of these in runs with a reference, which should have told: each upper bound counts them as lost")
+    unjudged = count(
+        "of these in runs with a reference, which should have shown it: each upper bound counts them as lost"
+    )
     after_alarm = count("further passes without use because of an alarm before the piece")
     loss_share = real("1", "lost or wrong passes of those judged", min=0)
     loss_low = real("1", "exact lower bound (Clopper-Pearson); 0 where nothing was judged", min=0)
@@ -164,9 +166,9 @@ class LineBalises(dy.Schema):
     direction = one_of(BaliseDirection, "in which direction along its net element it is valid")
     why = text("of a physical one: class and cause of the piece, per direction of travel over its net element")
     near = text("station or signal that it serves; empty where none")
-    distance_m = real("m", "way from the balise before; null for the first", min=0)
-    odometer_confidence_m = real("m", "confidence of the odometer there, 5 m + 5 % of this way", min=0)
-    largest_undetected_m = real("m", "largest undetected error seen on the way; null where not in the tables", min=0)
+    distance_m = real("m", "distance from the balise before; null for the first", min=0)
+    odometer_confidence_m = real("m", "confidence of the odometer there, 5 m + 5 % of this distance", min=0)
+    largest_undetected_m = real("m", "largest undetected error over this distance; null where not in the tables", min=0)
     proved = flag("suitable in every direction of travel, not just in those that were run")
 
 

@@ -80,6 +80,7 @@ MISFIT_PLACES = _sentences(MisfitPlace, "misfit_places")
 LOST = _sentences(LostTo, "lost")
 NOT_SHOWN = _sentences(NotShown, "not_shown")
 REMEDIES = _sentences(Remedy, "remedies")
+EVIDENCE_LIMITS = _sentences(Evidence, "evidence_limits")
 JUDGES: Mapping[str, str] = {kind.value: words for kind, words in _sentences(Evidence, "judges").items()}
 
 

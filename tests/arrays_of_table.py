@@ -9,13 +9,13 @@ from typing import Any, TypeVar
 
 import numpy as np
 import polars as pl
-from schemas.monitors import MONITORS
 
 from pipeline.stages.epochs.verdicts import Verdicts, no_verdicts
 from pipeline.stages.evidence import TruePlaces
 from pipeline.stages.judge.judged import Judgements
 from schemas.arrays import flags, floats, ints, times_ns, truths
 from schemas.enums import Evidence, Judgement, LdsMode, LdsState, LostTo, NotEvaluated, SigmaSource
+from schemas.monitors import MONITORS
 from schemas.stages import MatchedEpochs
 
 Epochs = TypeVar("Epochs", bound=MatchedEpochs)

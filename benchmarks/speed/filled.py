@@ -52,17 +52,17 @@ def filled(log: Path, seed: int = 1) -> Path:
 def _fields(seconds: Floats, speed_mps: Floats, rng: np.random.Generator) -> Floats:
     """The doubles of each message, shape (messages, 85)."""
     dt = np.diff(seconds, prepend=seconds[:1])
-    way_m = np.cumsum(speed_mps * dt)
-    yaw = _SWING_RAD * np.sin(way_m / _BEND_M) + np.cumsum(rng.normal(0.0, _GYRO_RADPS, dt.size) * dt)
+    travelled_m = np.cumsum(speed_mps * dt)
+    yaw = _SWING_RAD * np.sin(travelled_m / _BEND_M) + np.cumsum(rng.normal(0.0, _GYRO_RADPS, dt.size) * dt)
     found = np.zeros((seconds.size, _DOUBLES))
     nothing = np.zeros(seconds.size)
     east, north = np.cumsum(speed_mps * dt * np.cos(yaw)), np.cumsum(speed_mps * dt * np.sin(yaw))
     found[:, _POSE] = np.column_stack([east, north, nothing, nothing, nothing, np.sin(yaw / 2.0), np.cos(yaw / 2.0)])
     turn = np.gradient(yaw, seconds) + rng.normal(0.0, _GYRO_RADPS, dt.size)
     found[:, _TWIST] = np.column_stack([speed_mps, nothing, nothing, nothing, nothing, turn])
-    grown = 1e-4 * way_m
+    grown = 1e-4 * travelled_m
     found[:, _POSE_VARIANCES] = np.column_stack(
-        [grown, grown, nothing + 1e6, nothing + 1e6, nothing + 1e6, 1e-6 * way_m]
+        [grown, grown, nothing + 1e6, nothing + 1e6, nothing + 1e6, 1e-6 * travelled_m]
     )
     found[:, _TWIST_VARIANCES] = (2.5e-3, 1e-6, 1e6, 1e6, 1e6, 1e-6)
     return found

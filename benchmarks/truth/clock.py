@@ -30,7 +30,7 @@ class Drawn:
     family: str
     begin_s: np.ndarray
     end_s: np.ndarray
-    way_m: np.ndarray
+    travelled_m: np.ndarray
     counter: CounterRows
     lag_s: float
     scale: float
@@ -160,7 +160,7 @@ def noise(rng: np.random.Generator, t_s: np.ndarray) -> np.ndarray:
 
 
 def estimate(drawn: Drawn) -> ScaleLag:
-    return scale_and_lag(drawn.begin_s, drawn.end_s, drawn.way_m, drawn.counter)
+    return scale_and_lag(drawn.begin_s, drawn.end_s, drawn.travelled_m, drawn.counter)
 
 
 def figures(draws: int, seed: int) -> list[Figure]:

@@ -41,7 +41,7 @@ class Journey:
     """The truth each `_FINE_S`: way [m], and places east, north, up [m]."""
 
     t_s: Floats
-    way_m: Floats
+    travelled_m: Floats
     places_m: Floats
 
 
@@ -62,13 +62,13 @@ def journey(rng: Rng, length_s: float) -> Journey:
         room[:] = (top * shape * (1.0 + wander * shape))[: room.size]
         at += ride
     speed = uniform_filter1d(np.maximum(speed, 0.0), int(1.0 / _FINE_S))
-    way_m = np.cumsum(speed) * _FINE_S
-    along = np.arange(0.0, way_m[-1] + 20.0, 10.0)
+    travelled_m = np.cumsum(speed) * _FINE_S
+    along = np.arange(0.0, travelled_m[-1] + 20.0, 10.0)
     turn = np.cumsum(_correlated(rng, along.size, 300.0, 10.0)) * 10.0 * rng.uniform(0.0, 1.0 / 600.0)
     grade = _correlated(rng, along.size, 800.0, 10.0) * rng.uniform(0.0, 0.012)
     course = turn + rng.uniform(0.0, 2 * np.pi)
     axes = (np.cumsum(part) * 10.0 for part in (np.sin(course), np.cos(course), grade))
-    return Journey(t_s, way_m, np.column_stack([np.interp(way_m, along, axis) for axis in axes]))
+    return Journey(t_s, travelled_m, np.column_stack([np.interp(travelled_m, along, axis) for axis in axes]))
 
 
 def _correlated(rng: Rng, size: int, tau: float, step: float) -> Floats:
@@ -131,14 +131,14 @@ def independent(rng: Rng, truth: Journey, kind: str, fixes_s: Floats) -> pl.Data
     step_s = 1.0 / rng.choice([1.0, 2.0, 5.0, 10.0, 20.0, 50.0])
     own = np.arange(0.5, truth.t_s[-1] - 0.5, step_s)
     t_s = fixes_s if rng.random() < 0.5 else own + rng.uniform(0.0, 0.5) + 0.1 * step_s * rng.uniform(-1, 1, own.size)
-    seen_s = t_s - rng.uniform(0.0, 0.5)
-    way = np.interp(seen_s, truth.t_s, truth.way_m) * rng.uniform(0.98, 1.02)
-    speed = np.gradient(np.interp(truth.t_s, truth.t_s, truth.way_m), _FINE_S)
+    sampled_s = t_s - rng.uniform(0.0, 0.5)
+    way = np.interp(sampled_s, truth.t_s, truth.travelled_m) * rng.uniform(0.98, 1.02)
+    speed = np.gradient(np.interp(truth.t_s, truth.t_s, truth.travelled_m), _FINE_S)
     if rng.random() < 0.3:  # slip now and then
         begin = rng.uniform(0.0, truth.t_s[-1], 6)
         slip = np.any([(truth.t_s > b) & (truth.t_s < b + rng.uniform(2.0, 10.0)) for b in begin], axis=0)
         speed = speed * np.where(slip & (speed > 1.0), rng.uniform(1.02, 1.3), 1.0)
-        way = np.interp(seen_s, truth.t_s, np.cumsum(speed) * _FINE_S)
+        way = np.interp(sampled_s, truth.t_s, np.cumsum(speed) * _FINE_S)
     if kind == "pulses":
         pulse = rng.choice([0.02, 0.05, 0.1, 0.3, 0.5, 1.0])
         return odometer_frame(t_s, np.floor(way / pulse) * pulse, None)
@@ -147,14 +147,14 @@ def independent(rng: Rng, truth: Journey, kind: str, fixes_s: Floats) -> pl.Data
         return odometer_frame(t_s, way + walk, None)
     if kind == "digits":
         digit = rng.choice([0.1, 1.0]) / 3.6
-        return odometer_frame(t_s, None, np.round(_smooth(rng, speed, seen_s, truth) / digit) * digit)
+        return odometer_frame(t_s, None, np.round(_smooth(rng, speed, sampled_s, truth) / digit) * digit)
     noise = rng.uniform(0.02, 0.5) * _correlated(rng, t_s.size, rng.uniform(1.0, 30.0), float(np.median(np.diff(t_s))))
-    return odometer_frame(t_s, None, _smooth(rng, speed, seen_s, truth) + noise)
+    return odometer_frame(t_s, None, _smooth(rng, speed, sampled_s, truth) + noise)
 
 
-def _smooth(rng: Rng, speed: Floats, seen_s: Floats, truth: Journey) -> Floats:
+def _smooth(rng: Rng, speed: Floats, sampled_s: Floats, truth: Journey) -> Floats:
     window = int(rng.choice([0.1, 0.5, 1.0, 2.0]) / _FINE_S)
-    return np.asarray(np.interp(seen_s, truth.t_s, uniform_filter1d(speed, window)))
+    return np.asarray(np.interp(sampled_s, truth.t_s, uniform_filter1d(speed, window)))
 
 
 def copied(rng: Rng, truth: Journey, kind: str, t_s: Floats, places: Floats) -> pl.DataFrame:
@@ -170,7 +170,7 @@ def copied(rng: Rng, truth: Journey, kind: str, t_s: Floats, places: Floats) -> 
     ahead = np.gradient(true, axis=0)
     ahead /= np.maximum(np.linalg.norm(ahead, axis=1), 1e-6)[:, None]
     off_m = np.einsum("ij,ij->i", places[:, :2] - true, ahead)
-    return odometer_frame(t_s, np.round(np.interp(t_s, truth.t_s, truth.way_m) + off_m, 2), None)
+    return odometer_frame(t_s, np.round(np.interp(t_s, truth.t_s, truth.travelled_m) + off_m, 2), None)
 
 
 def tried(seed: int, receiver: str, kind: str, minutes: float | None = None) -> Follows:

@@ -183,10 +183,10 @@ def ramps(count: int, seed: int) -> None:
             delays_s = delays_s[np.isfinite(delays_s[:, 1]) & ~np.isnan(delays_s[:, 0])]
             found = delays_s[:, 0] / delays_s[:, 1]
             ratios += found.tolist()
-            unseen = (delays_s * rate_mps > 20.0).sum(axis=0).tolist()
+            undetected = (delays_s * rate_mps > 20.0).sum(axis=0).tolist()
             print(
-                f"{rate_mps:g} m/s: {np.median(found):.2f} times later, at most {found.max():.2f}; beyond 20 m unseen"
-                f" {unseen[0]}, with noise given {unseen[1]} of {found.size}: {receiver}",
+                f"{rate_mps:g} m/s: {np.median(found):.2f} times later, at most {found.max():.2f}; beyond 20 m"
+                f" undetected {undetected[0]}, with noise given {undetected[1]} of {found.size}: {receiver}",
                 flush=True,
             )
     print(f"all: median {np.median(ratios):.2f}, 95 % {np.quantile(ratios, 0.95):.2f}")

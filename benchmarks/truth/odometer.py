@@ -55,9 +55,9 @@ def beyond_bound(drives: int) -> None:
 
 
 def _ways(rng: np.random.Generator, rate_hz: int, least_m: float, most_m: float) -> tuple[Floats, Bools]:
-    fine_s, way_m = drive(rng, DURATION_S)
+    fine_s, travelled_m = drive(rng, DURATION_S)
     t_s = np.arange(0.0, DURATION_S - 1.0, 1.0 / rate_hz)
-    true_m = np.interp(t_s, fine_s, way_m)
+    true_m = np.interp(t_s, fine_s, travelled_m)
     rows = rng.choice(np.arange(20, t_s.size - 20), 8, replace=False)
     sets_m = sum(rng.uniform(least_m, most_m) * (np.arange(t_s.size) >= row) for row in rows)
     odometry = counted(t_s, true_m + sets_m)

@@ -69,7 +69,7 @@ class Drive:
     element: np.ndarray
     measure_m: np.ndarray
     place: np.ndarray
-    way_m: np.ndarray
+    chainage_m: np.ndarray
 
 
 @dataclass(frozen=True)
@@ -355,7 +355,7 @@ def judge(name: str, seed: int) -> Verdict:
     place = truth.place + error * [1.0, 1.0, 1.5]
     fixes = fixes_at(place[:, 0], place[:, 1], truth.t_s, stated(rng, sigma_m))
     fixes = fixes.with_columns(height_m=pl.Series(place[:, 2] + 300.0 + rng.normal()))
-    way = odometer_at(truth.t_s, truth.way_m * (1.0 + 0.003 * rng.normal())) if rng.random() < 0.7 else None
+    way = odometer_at(truth.t_s, truth.chainage_m * (1.0 + 0.003 * rng.normal())) if rng.random() < 0.7 else None
     odometry = odometry_of(way, Vehicle(), Configuration())
     found = match(fixes, odometry, site, Vehicle(), MatchingConfig(), FixSigma())
     return verdict(world, truth, found.epochs.table, np.hypot(error[:, 0], error[:, 1]))
@@ -384,8 +384,8 @@ def apart_m(world: World, name: str, place: np.ndarray) -> float:
 
 def path_off_m(truth: Drive, epochs: pl.DataFrame, known: np.ndarray) -> float:
     """How far the path position runs away from the way driven, but for which way it grows."""
-    path_m, way_m = floats(epochs, "path_m")[known], truth.way_m[known]
-    moved, driven = path_m - path_m[0], way_m - way_m[0]
+    path_m, chainage_m = floats(epochs, "path_m")[known], truth.chainage_m[known]
+    moved, driven = path_m - path_m[0], chainage_m - chainage_m[0]
     return float(min(np.abs(moved - driven).max(), np.abs(moved + driven).max()))
 
 

@@ -200,7 +200,7 @@ def outcome(family: str, seed: int) -> Outcome:
     fixes = fixes_at(place[:, 0], place[:, 1], truth.t_s, sigma_m)
     fixes = fixes.with_columns(height_m=pl.Series(place[:, 2] + 300.0 + rng.normal()))
     vehicle = Vehicle.model_validate({"odometer_origin": str(rng.choice(["wheel", "unknown"]))})
-    way = odometer_at(truth.t_s, truth.way_m * (1.0 + 0.003 * rng.normal()))
+    way = odometer_at(truth.t_s, truth.chainage_m * (1.0 + 0.003 * rng.normal()))
     odometry = odometry_of(way, vehicle, Configuration())
     found = match(fixes, odometry, site_of(world, survey_m, law, rng), vehicle, MatchingConfig(), FixSigma())
     epochs = found.epochs.table

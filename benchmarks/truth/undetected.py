@@ -1,4 +1,4 @@
-"""The largest unnoticed error, proved: its profile injected into the same run goes unseen, 5 % more does not.
+"""The largest unnoticed error, proved: its profile injected into the same run is not detected, 5 % more is.
 
 Random runs: speeds, stops, sigmas, rates, outages, balise reads, scale and latency of a vehicle file; on straight
 track, where the bank is exactly linear in the fault, and on curves. At a random epoch and in a random direction the
@@ -58,19 +58,19 @@ class Trial:
 class Outcome:
     """One profile: the exact optimum [m], the table's bound over it, by how much the judge's error differs [m].
 
-    `silent`: no new fail up to the epoch; `seen_scaled`: one at 1.05 of it; `held_by_rate`: no monitor held it, but the
-    largest rate of a fault (the first epochs at 10 Hz, where the raw monitor allows more); `silent_scale`: the largest
-    scale of `_CURVED_SCALES` that stays unseen (1 on straight track).
+    `not_detected`: no new fail up to the epoch; `detected_scaled`: one at 1.05 of it; `held_by_rate`: no monitor held
+    it, but the largest rate of a fault (the first epochs at 10 Hz, where the raw monitor allows more);
+    `undetected_scale`: the largest scale of `_CURVED_SCALES` that stays undetected (1 on straight track).
     """
 
     seed: int
     error_m: float
     closeness: float
     judged_apart_m: float
-    silent: bool
-    seen_scaled: bool
+    not_detected: bool
+    detected_scaled: bool
     held_by_rate: bool
-    silent_scale: float
+    undetected_scale: float
 
 
 _GIVEN_M = dict.fromkeys(("noise_along_m", "noise_cross_m", "noise_up_m"), (0.0, 0.0, 0.0, 0.0))
@@ -181,16 +181,16 @@ def proof(seed: int, curved: bool, folder: Path) -> Outcome | None:
     size_m = found.fault["size_m"][-1] * clean["direction"][epoch]
     apart = floats(once, "error_along_m")[epoch] - floats(clean, "error_along_m")[epoch] - size_m
     scales = _CURVED_SCALES if curved else (1.0,)
-    unseen = (scale for scale in scales if not _new_fail(clean, _injected(trial, found, scale, folder), epoch))
+    passing = (scale for scale in scales if not _new_fail(clean, _injected(trial, found, scale, folder), epoch))
     return Outcome(
         seed=seed,
         error_m=found.error_m,
         closeness=found.bound_m / found.error_m,
         judged_apart_m=abs(float(apart)),
-        silent=not _new_fail(clean, once, epoch),
-        seen_scaled=_new_fail(clean, _injected(trial, found, SCALED, folder), epoch),
+        not_detected=not _new_fail(clean, once, epoch),
+        detected_scaled=_new_fail(clean, _injected(trial, found, SCALED, folder), epoch),
         held_by_rate=_held_by_rate(found, config),
-        silent_scale=next(unseen, 0.0) if curved else 1.0,
+        undetected_scale=next(passing, 0.0) if curved else 1.0,
     )
 
 
@@ -270,14 +270,14 @@ def measure(out: Path) -> list[Figure]:
     monitored = [one for one in straight if not one.held_by_rate]
     return [
         Figure("profiles on straight track", len(straight), ""),
-        Figure("... that a monitor saw", sum(not one.silent for one in straight), "", 0.0),
+        Figure("... that a monitor saw", sum(not one.not_detected for one in straight), "", 0.0),
         Figure("... held by the largest rate of a fault alone", sum(one.held_by_rate for one in straight), ""),
-        Figure("... of the others, that none saw at 1.05", sum(not one.seen_scaled for one in monitored), "", 0.0),
+        Figure("... of the others, that none saw at 1.05", sum(not one.detected_scaled for one in monitored), "", 0.0),
         Figure("largest difference of the judge's error", max(one.judged_apart_m for one in straight), "m", 1e-6),
         Figure("bound over optimum, smallest", min(one.closeness for one in straight), "", 1.0, "above"),
         Figure("bound over optimum, largest", max(one.closeness for one in straight), "", 1.1),
         Figure("profiles on curves", len(curved), ""),
-        Figure("largest scale that no monitor saw", max(one.silent_scale for one in curved), "", 1.01),
-        Figure("smallest scale that no monitor saw", min(one.silent_scale for one in curved), ""),
+        Figure("largest scale that no monitor saw", max(one.undetected_scale for one in curved), "", 1.01),
+        Figure("smallest scale that no monitor saw", min(one.undetected_scale for one in curved), ""),
         *_hours(),
     ]

@@ -124,8 +124,13 @@ def bank_figures(
             sigmas, rng = along_sigmas_m(sky, heading), np.random.default_rng([9, repetition, int(heading)])
             size = _WARM_S + 60 * minutes[-1] + 1
             rows = watched_of(noise_of(sigmas, size, rng), sigmas, alphas)
-            seen = _with_doppler(rows.after_fix(_WARM_S, size - 1)) if velocity else rows.after_fix(_WARM_S, size - 1)
-            both = [largest_errors(one, Configuration().undetected).most_m for one in (seen, seen.in_other_direction())]
+            monitored = (
+                _with_doppler(rows.after_fix(_WARM_S, size - 1)) if velocity else rows.after_fix(_WARM_S, size - 1)
+            )
+            both = [
+                largest_errors(one, Configuration().undetected).most_m
+                for one in (monitored, monitored.in_other_direction())
+            ]
             larger.append(np.maximum(*both))
     median = np.median(larger, axis=0)
     beyond = np.flatnonzero(median > 20.0)
@@ -171,7 +176,7 @@ def shape_figures(constellation: Constellation, repetitions: int, minutes: tuple
 
 
 def ramp_figures(draws: int) -> list[dict[str, object]]:
-    """Share of draws of noise in which a ramp of ten minutes goes unseen, against the experiment's probability.
+    """Share of draws of noise in which a ramp of ten minutes is not detected, against the experiment's probability.
 
     One side counts the draws whose largest unnoticed ramp is as steep, by the linear bounds of this room. The other
     samples misses (`datasets.experiment.rare`) with the bank's state equations, and shares nothing with it.
@@ -196,7 +201,7 @@ def ramp_figures(draws: int) -> list[dict[str, object]]:
         figures.append(
             {
                 "ramp m/s": rate_mps,
-                "share unseen": share,
+                "share undetected": share,
                 "experiment": sampled.value,
                 "sigmas apart": (share - sampled.value) / max(float(deviation), 1e-12),
             }
@@ -214,8 +219,8 @@ def range_figure(constellation: Constellation, heading_deg: float) -> float:
     weight = 1.0 / sky.range_variance_m2.sum(axis=1)
     normal = design.T @ (weight[:, None] * design) + np.diag([0.0, 1.0, 1.0, *np.zeros(clocks.shape[1])])
     freedom = len(sky.svs) - 1 - clocks.shape[1]
-    seen = weight - weight**2 * np.einsum("ni,ij,nj->n", design, np.linalg.inv(normal), design)
-    size = np.sqrt((chdtri(freedom, _PROBABILITY) - freedom) / seen)
+    shown = weight - weight**2 * np.einsum("ni,ij,nj->n", design, np.linalg.inv(normal), design)
+    size = np.sqrt((chdtri(freedom, _PROBABILITY) - freedom) / shown)
     return float(np.abs(ahead @ sky.gain * size).max())
 
 

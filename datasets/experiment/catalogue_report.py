@@ -179,8 +179,8 @@ def _undetected_lines(faults: pl.DataFrame) -> list[str]:
     for row in faults.filter(pl.col("detected") < 0.5).iter_rows(named=True):
         harm = f"unsafe in {row['runs_with_unsafe']} of {row['runs']}" if row["runs_with_unsafe"] else "nothing unsafe"
         linking = ", linking errors tell" if row["seen_by_linking_alone"] * 2 > row["runs"] else ""
-        seen = f", seen in {_percent(row['detected'])}" if row["detected"] else ""
-        lines.append(f"- {row['fault']}: {harm}{linking}{seen}")
+        share = f", seen in {_percent(row['detected'])}" if row["detected"] else ""
+        lines.append(f"- {row['fault']}: {harm}{linking}{share}")
     return lines or ["- nothing"]
 
 

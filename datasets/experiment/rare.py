@@ -15,7 +15,6 @@ from pathlib import Path
 
 import numpy as np
 import polars as pl
-from schemas.monitors import SCALES
 
 from datasets.experiment.bank import READINGS, SENSORS, BankSpec, LinearBank, bank_of_axis, linear_bank
 from datasets.experiment.geometry import CONSTELLATIONS, Constellation, default_geometry
@@ -35,6 +34,7 @@ from schemas.config import Configuration, threshold_factor
 from schemas.enums import MonitorState, RunStatus
 from schemas.errors import UsageError
 from schemas.frozen import frozen
+from schemas.monitors import SCALES
 
 REPETITIONS = 20_000
 TARGETS: tuple[float, ...] = (1e-4, 1e-9)

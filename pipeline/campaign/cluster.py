@@ -40,7 +40,7 @@ class DaskEngine(Engine):
         self._limit_s = limit_s
         self._threads = 0
         self._counted_s = -WAITS.count_every_s
-        self._seen_s = self._heard_s = time.monotonic()
+        self._workers_last_s = self._heard_s = time.monotonic()
         self.name = redacted(scheduler)
         self._tasks: dict[Result, Any] = {}
         self._workers: dict[str, str] = {}
@@ -52,12 +52,12 @@ class DaskEngine(Engine):
             self._threads = self._count_threads()
             self._counted_s = time.monotonic()
             if self._threads:
-                self._seen_s = self._counted_s
+                self._workers_last_s = self._counted_s
         return max(1, 2 * self._threads)
 
     def time_without_worker_s(self) -> float:
         """Time for which there has been no worker [s]."""
-        return 0.0 if self._threads else time.monotonic() - self._seen_s
+        return 0.0 if self._threads else time.monotonic() - self._workers_last_s
 
     def submit(self, job: RunJob) -> Result:
         """Hand a run to the cluster; the result is set when its task ends, however that was."""

@@ -88,14 +88,14 @@ def _hold_remote(out: str, name: str) -> Iterator[None]:
 
 def _wait_for_silence(place: str, out: str) -> None:
     """Wait until the holder of a lock must be gone; refuse if it renews the lock meanwhile."""
-    seen = _read_lock(place)
+    before = _read_lock(place)
     until = time.monotonic() + WAITS.lock_silence_s
-    while seen and time.monotonic() < until:
+    while before and time.monotonic() < until:
         time.sleep(WAITS.lock_beat_s / 4)
         now = _read_lock(place)
-        if now and now != seen:
+        if now and now != before:
             raise _busy_error(out)
-        seen = now
+        before = now
 
 
 def _read_lock(place: Address) -> str:

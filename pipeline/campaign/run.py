@@ -231,7 +231,7 @@ def run_campaign(
         scheduler: address of a Dask scheduler; None: this machine.
         force: replay runs whose result is there already, too.
         time_limit_s: longest time for one run [s].
-        watches: what is told of the progress.
+        watches: what follows the progress.
 
     Returns:
         What became of each run.

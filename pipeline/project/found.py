@@ -63,39 +63,39 @@ def look_around(folder: Path) -> Found:
 
 def _walk_once(folder: Path) -> Iterator[Path]:
     """Regular files, and folders that are one thing, each once: by its own name rather than by that of a link."""
-    seen = {os.path.realpath(folder)}
+    visited = {os.path.realpath(folder)}
     links: list[Path] = []
-    yield from _things_inside(folder, seen, links)
+    yield from _things_inside(folder, visited, links)
     while links:
         link = links.pop(0)
-        if _note_if_new(link, seen):
-            yield from _things_at(link, seen, links)
+        if _note_if_new(link, visited):
+            yield from _things_at(link, visited, links)
 
 
-def _things_inside(folder: Path, seen: set[str], links: list[Path]) -> Iterator[Path]:
+def _things_inside(folder: Path, visited: set[str], links: list[Path]) -> Iterator[Path]:
     """Files and things inside a folder that were not seen yet; links are put off."""
     for path in sorted(folder.iterdir()):
         if path.is_symlink():
             links.append(path)
-        elif _note_if_new(path, seen):
-            yield from _things_at(path, seen, links)
+        elif _note_if_new(path, visited):
+            yield from _things_at(path, visited, links)
 
 
-def _note_if_new(path: Path, seen: set[str]) -> bool:
+def _note_if_new(path: Path, visited: set[str]) -> bool:
     """Whether a path is seen for the first time, by its own name; it is then."""
     real = os.path.realpath(path)
-    is_new = real not in seen
-    seen.add(real)
+    is_new = real not in visited
+    visited.add(real)
     return is_new
 
 
-def _things_at(path: Path, seen: set[str], links: list[Path]) -> Iterator[Path]:
+def _things_at(path: Path, visited: set[str], links: list[Path]) -> Iterator[Path]:
     """The thing at a path, or those below it; nothing for results and hidden files."""
     if path.name.startswith(".") or path.name == FILE_NAME or (path / "manifest.json").is_file():
         return
     require_name(path)
     if path.is_dir() and not is_site(path) and not is_one_log(path):
-        yield from _things_inside(path, seen, links)
+        yield from _things_inside(path, visited, links)
     elif path.is_dir() or (path.is_file() and path.suffix.lower() not in _COMPANION_SUFFIXES):
         yield path
 

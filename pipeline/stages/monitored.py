@@ -10,7 +10,6 @@ from dataclasses import replace
 
 import numpy as np
 import polars as pl
-from schemas.monitors import ALL_MONITORS
 
 from pipeline.stages.alignment.align import alignment, odometer_at
 from pipeline.stages.epochs.verdicts import MonitoredEpochs, Verdicts
@@ -26,6 +25,7 @@ from pipeline.stages.prepare import PreparedRun
 from schemas.arrays import times_ns
 from schemas.enums import NotEvaluated
 from schemas.frozen import frozen
+from schemas.monitors import ALL_MONITORS
 from schemas.stages import AlignedEpochs
 
 _AGAINST_ODOMETER = tuple(monitor.name for monitor in ALL_MONITORS if monitor.against_odometer)

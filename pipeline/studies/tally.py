@@ -40,7 +40,7 @@ class Compliance(StrEnum):
 class Shown:
     """A finding with the bounds that it rests on; `needed`: good trials or hours still needed to show the limit.
 
-    `needed` is None where no number of them does, or too many to be told.
+    `needed` is None where no number of them does, or too many to be stated.
     """
 
     finding: Compliance

@@ -49,7 +49,7 @@ def auto(plan: Plan) -> Plan:
     return calibrate_plan(plan, ["auto"])
 
 
-_SEEN: dict[str, Any] = {}
+_RESULTS: dict[str, Any] = {}
 
 
 @pytest.fixture
@@ -57,7 +57,7 @@ def remembered(monkeypatch: pytest.MonkeyPatch) -> None:
     """A run tells the same whoever asks, and telling takes seconds."""
 
     def each_once(function: Callable[[RunJob], Any], tasks: Sequence[RunJob], jobs: int) -> list[Any]:
-        return [_SEEN.setdefault(task.address, _SEEN.get(task.address) or function(task)) for task in tasks]
+        return [_RESULTS.setdefault(task.address, _RESULTS.get(task.address) or function(task)) for task in tasks]
 
     monkeypatch.setattr(calibrated_module, "map_in_processes", each_once)
 

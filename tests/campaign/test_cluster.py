@@ -176,14 +176,14 @@ def test_hanging_worker_is_given_up(
 ) -> None:
     """Also one that cannot end itself, since the whole process stands still."""
     endless(tmp_path / "hanging.mcap")
-    seen: list[int] = []
+    workers: list[int] = []
     clock = Hurried(monkeypatch, "run")
 
     def stop(run_id: str, age_s: float) -> None:
-        if run_id == "hanging" and age_s > _BEGUN_S and not seen:
-            seen.extend(cluster.worker_pids)
+        if run_id == "hanging" and age_s > _BEGUN_S and not workers:
+            workers.extend(cluster.worker_pids)
             if stopped:
-                os.kill(seen[0], signal.SIGSTOP)
+                os.kill(workers[0], signal.SIGSTOP)
             clock.hurry(_LIMIT_S)
 
     plan = plan_of(small_trial, tmp_path / "out", [tmp_path / "hanging.mcap", *small_trial.paths[:2]])

@@ -40,12 +40,12 @@ class Spy:
 
     def __init__(self, act: Callable[[str, float], None]) -> None:
         self.act = act
-        self.seen: list[RunOutcome] = []
+        self.ended: list[RunOutcome] = []
         self.losses: list[tuple[str, int]] = []
         self.notes: list[str] = []
 
     def begin(self, runs: int, out: str) -> None:
-        self.seen.clear()
+        self.ended.clear()
 
     def look(self, under_way: Sequence[tuple[str, float]]) -> None:
         for run_id, age_s in under_way:
@@ -58,10 +58,10 @@ class Spy:
         self.notes.append(text)
 
     def finished(self, outcome: RunOutcome) -> None:
-        self.seen.append(outcome)
+        self.ended.append(outcome)
 
     def end(self, summary: CampaignSummary) -> None:
-        assert len(self.seen) == len(summary.outcomes)
+        assert len(self.ended) == len(summary.outcomes)
 
 
 def one_run(trial: SmallTrial, folder: Path) -> Path:
@@ -319,7 +319,7 @@ def test_hanging_run_is_given_up(small_trial: SmallTrial, tmp_path: Path, monkey
     clock = Hurried(monkeypatch, "run")
 
     def hurry(run_id: str, age_s: float) -> None:
-        if run_id == "hanging" and age_s > 0.0 and len(spy.seen) == 2:
+        if run_id == "hanging" and age_s > 0.0 and len(spy.ended) == 2:
             clock.hurry(3600.0)
 
     plan = plan_of(small_trial, tmp_path / "out", [tmp_path / "hanging.mcap", *small_trial.paths[:2]])

@@ -26,7 +26,7 @@ ARRAYS = {"sql"}
 # The demo takes long; `tests/datasets/test_demo.py` holds its fields.
 SLOW = {"demo"}
 # What the recordings at hand do not show.
-UNSEEN = {
+NOT_IN_EXAMPLES = {
     "init": {"corrections[]." + name for name in ("run_id", "found", "toml", "accepted")},
     "trial": {"corrections[]." + name for name in ("run_id", "found", "toml", "accepted")},
     "inspect": {
@@ -66,7 +66,7 @@ def test_answers_have_the_fields_of_the_page(section: str, workplace: Path, capf
             there = set() if section in ARRAYS else set(places(found, documented))
             assert always <= there
             answered |= there
-    assert answered == set(documented) - UNSEEN.get(section, set())
+    assert answered == set(documented) - NOT_IN_EXAMPLES.get(section, set())
 
 
 def _prepare(folder: Path) -> None:

@@ -133,6 +133,7 @@ DETECTIONS = [
 EVIDENCE = [
     (ENUMS, '    BALISE = "balise"', '    DETECTOR = "detector"\n'),
     (WORDS, 'balise = "balise reads"', 'detector = "trackside detectors"\n'),
+    (WORDS, 'reference = ""\n', 'detector = "evidence detector: nothing is known of the stops"\n'),
     (
         LIMITS,
         "    known_error_m: Positive = 5.0",
@@ -243,6 +244,7 @@ print(json.dumps({
     "evidence": clean.runs.select("evidence", "verdict", "reasons").row(0),
     "unseen": unseen["verdict"].to_list(),
     "judged_by": JUDGES["detector"],
+    "noted": "evidence detector: nothing is known of the stops" in clean.runs["notes"].item(),
     "shifted": shifted.runs.select("evidence", "verdict", "reasons").row(0),
     "drawn": monitor_lines()["other"],
     "series": sorted(name for name in page["series"] if "offside" in name),
@@ -342,6 +344,7 @@ def test_a_kind_of_evidence_takes_five_files_and_its_stream(followed: dict[str, 
     assert followed["shifted"] == ["detector", "unsafe", ["failure_beyond_budget", "nothing_accepted"]]
     assert followed["unseen"] == ["unproven"]
     assert followed["judged_by"] == "trackside detectors"
+    assert followed["noted"] is True
     assert len({file for file, _, _ in EVIDENCE}) == 5
     assert len({file for file, _, _ in DETECTIONS}) == 3
 

@@ -106,10 +106,10 @@ def main() -> int:
     apart = 0
     for target in (1e-3, 1e-4, 1e-5):
         for what, sampled, counted in comparisons(target):
-            met = agree(sampled, counted)
-            apart += not met
+            agrees = agree(sampled, counted)
+            apart += not agrees
             line = f"sampled {sampled.value:.3g} +- {sampled.relative_error:.0%}, counted {counted.value:.3g}"
-            print(f"{target:g} {what}: {line} in {counted.runs}{'' if met else ', apart'}", flush=True)
+            print(f"{target:g} {what}: {line} in {counted.runs}{'' if agrees else ', apart'}", flush=True)
     return 1 if apart > 1 else 0
 
 

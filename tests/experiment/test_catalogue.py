@@ -117,13 +117,13 @@ def test_lists_and_reads_change_behind_the_onset_alone(short: PreparedJourney, h
 def runs_by_hand() -> pl.DataFrame:
     """Three runs of one fault: found at 4 s before the failure at 10 s, found too late at 12 s, not found."""
 
-    def seen(**times: float) -> list[float | None]:
+    def first_fails(**times: float) -> list[float | None]:
         return [times.get(monitor) for monitor in MONITORS]
 
     rows = [
-        (4.0, 120.0, ["along_raw"], 10.0, 0, 0, seen(along_raw=4.0, channel=9.0)),
-        (12.0, 360.0, ["channel", "up_raw"], 10.0, 1, 2, seen(channel=12.0, up_raw=12.0)),
-        (None, None, [], 10.0, 3, 1, seen()),
+        (4.0, 120.0, ["along_raw"], 10.0, 0, 0, first_fails(along_raw=4.0, channel=9.0)),
+        (12.0, 360.0, ["channel", "up_raw"], 10.0, 1, 2, first_fails(channel=12.0, up_raw=12.0)),
+        (None, None, [], 10.0, 3, 1, first_fails()),
     ]
     return pl.DataFrame(
         [
@@ -212,18 +212,18 @@ def test_what_no_monitor_sees_is_said(found: pl.DataFrame) -> None:
     assert "- `link_order`: among the first for step along 1200 m" in page
     assert "- `link_distance`: before all others for outage of 90 s, then off by 300 m (100.0%, alone)" in page
     assert "range ramp 0.03 m/s (100.0%, by" in page
-    unseen = page.split("## What no monitor sees")[1].split("##")[0]
-    assert "outage of 90 s, then off by" not in unseen
-    assert "physical balise missing 2: nothing unsafe, linking errors tell" in unseen
-    assert "step cross" not in unseen
+    section = page.split("## What no monitor sees")[1].split("##")[0]
+    assert "outage of 90 s, then off by" not in section
+    assert "physical balise missing 2: nothing unsafe, linking errors tell" in section
+    assert "step cross" not in section
 
 
 def test_a_configuration_is_judged_as_it_is() -> None:
     config = Configuration(monitors=MonitorConfig(disabled=("cross_raw", "cross_ewma_0p1")))
     run = run_catalogue(1, 3, 1, config, [FAULTS["step cross 3 m"]]).row(0, named=True)
-    seen = dict(zip(MONITORS, run["seen_s"], strict=True))
-    assert seen["cross_raw"] is None
-    assert seen["cross_ewma_0p1"] is None
+    first_fails = dict(zip(MONITORS, run["seen_s"], strict=True))
+    assert first_fails["cross_raw"] is None
+    assert first_fails["cross_ewma_0p1"] is None
     assert not {"cross_raw", "cross_ewma_0p1"} & set(run["first"])
 
 

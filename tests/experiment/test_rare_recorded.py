@@ -8,13 +8,13 @@ from pathlib import Path
 import numpy as np
 import polars as pl
 import pytest
-from schemas.monitors import SCALES
 
 from datasets.experiment import EXPERIMENTS, rare
 from datasets.experiment.bank import BankSpec, bank_of_axis
 from datasets.experiment.sampling import missed_detection_probability
 from schemas.config import Configuration, MonitorConfig
 from schemas.errors import UsageError
+from schemas.monitors import SCALES
 
 SPEC = BankSpec(alphas=(1.0, 0.1, 0.01), false_alarm_probability=1e-4)
 R_M2, TAU_S, WHITE_M = np.array([0.2, 0.1, 0.0, 0.7]), np.array([360.0, 1800.0, 3600.0, 100.0]), 0.3

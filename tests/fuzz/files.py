@@ -36,7 +36,7 @@ from tests.fuzz.ingest import MUTATIONS, FuzzReport, Random
 
 _SLOWEST_S = 2.0
 # Names and statistics in the footer of Parquet have no checksum: damage there may pass.
-_UNSEEN_SHARE = 0.01
+_UNDETECTED_SHARE = 0.01
 _BYTES = ("flip", "cut", "overwrite", "insert")
 _TRACK = "netelement_id,measure_m,latitude_deg,longitude_deg,height_m,sigma_m\n" + "".join(
     f"a,{100 * number},50.{number},4.0,100.0,0.1\n" for number in range(9)
@@ -160,7 +160,7 @@ def parquet_case(gnss: pl.DataFrame) -> Case:
     def case(random: Random, folder: Path) -> str:
         (folder / "run").mkdir(exist_ok=True)
         (folder / "run/gnss.parquet").write_bytes(mutated(content, random))
-        return "whole" if read_run(folder / "run", IngestConfig()).gnss.equals(gnss) else "unseen"
+        return "whole" if read_run(folder / "run", IngestConfig()).gnss.equals(gnss) else "undetected"
 
     return case
 
@@ -226,12 +226,12 @@ def fuzz(count: int, seed: int = 1, first: int = 0, chosen: Mapping[str, Case] |
             report.mutations[f"{kind}: {word}"] += 1
             if word == "WRONG":
                 report.failures.append((number, kind, finding))
-    unseen, tried = (
-        report.outcomes["unseen"],
+    undetected, tried = (
+        report.outcomes["undetected"],
         sum(n for name, n in report.mutations.items() if name.startswith("parquet")),
     )
-    if unseen > max(2, _UNSEEN_SHARE * tried):
-        report.failures.append((-1, "parquet", f"{unseen} of {tried} changes were read without a word"))
+    if undetected > max(2, _UNDETECTED_SHARE * tried):
+        report.failures.append((-1, "parquet", f"{undetected} of {tried} changes were read without a word"))
     return report
 
 

@@ -259,10 +259,10 @@ class Page(HTMLParser):
 
 def recounted(tables: RunTables) -> dict[str, str]:
     """The figures of a page of one solution, row by row from its tables."""
-    met = [row for row in tables.passages.iter_rows(named=True) if row["kind"] == "virtual"]
-    beyond = [row for row in met if row["t_true"] is None and row["judgement"] == "wrong"]
-    passed = [row for row in met if row not in beyond]
-    accepted = [row for row in met if row["status"] == "accepted"]
+    virtual = [row for row in tables.passages.iter_rows(named=True) if row["kind"] == "virtual"]
+    beyond = [row for row in virtual if row["t_true"] is None and row["judgement"] == "wrong"]
+    passed = [row for row in virtual if row not in beyond]
+    accepted = [row for row in virtual if row["status"] == "accepted"]
     found = {row["balise_id"] for row in passed if row["status"] == "accepted"}
     begins = {
         row["t_onset"] or row["t_hazard"] for row in tables.hazards.iter_rows(named=True) if row["caused_by"] is None

@@ -246,8 +246,8 @@ def test_dates_are_in_the_order_that_fits_other_logs(tmp_path: Path) -> None:
         return InspectedLog(Path("a.ubx"), {"gnss": StreamSpan(10, *times)})
 
     def start(*others: InspectedLog) -> datetime | None:
-        seen = look_at_dates(tmp_path / "plc.csv", IngestConfig(), others)
-        return seen and seen.start
+        log = look_at_dates(tmp_path / "plc.csv", IngestConfig(), others)
+        return log and log.start
 
     assert start(on(6, 12)) == datetime(2025, 6, 12, 11, 30, tzinfo=UTC)
     assert start(on(12, 6)) == datetime(2025, 12, 6, 11, 30, tzinfo=UTC)

@@ -48,7 +48,7 @@ class World:
     config: Configuration
 
 
-def way_m(dice: np.random.Generator) -> tuple[Floats, Floats]:
+def chainage_m(dice: np.random.Generator) -> tuple[Floats, Floats]:
     """Times and places: stretches at random speeds with stands between them."""
     t_s = np.arange(0.0, LASTS_S, 0.05)
     knots_s = np.sort(dice.uniform(0.0, LASTS_S, 8))
@@ -121,7 +121,7 @@ def odometer_of(dice: np.random.Generator, name: str, t_s: Floats, place_m: Floa
 
 def world(seed: int) -> World:
     dice = np.random.default_rng(seed)
-    t_s, place_m = way_m(dice)
+    t_s, place_m = chainage_m(dice)
     solutions = [gnss_of(dice, name, t_s, place_m) for name in ("primary", "other")]
     sensors = [odometer_of(dice, name, t_s, place_m) for name in ("primary", "second")[: dice.integers(1, 3)]]
     passed = [(f"P{k}", float(np.interp(2_500.0 * k, place_m, t_s))) for k in range(1, 5) if place_m[-1] > 2_500.0 * k]
@@ -155,7 +155,7 @@ OF_THE_JUDGE = {
 }
 
 
-def seen(tables: RunTables, name: str, last: pl.DataFrame) -> pl.DataFrame:
+def complete_rows(tables: RunTables, name: str, last: pl.DataFrame) -> pl.DataFrame:
     """Rows that are complete at the last epochs of a cut log, without what the judge says of them."""
     frame: pl.DataFrame = getattr(tables, name)
     rows = frame.join(last, on="solution", how="left", maintain_order="left")
@@ -180,7 +180,7 @@ def test_what_comes_later_changes_nothing_that_was_before(seed: int) -> None:
         part = replay(cut(made.run, float(cut_s)), SITE, made.vehicle, made.config)
         last = part.epochs.group_by("solution").agg(last=pl.col("t").max())
         for name in ("epochs", "passages", "alarms"):
-            found, expected = seen(part, name, last), seen(whole, name, last)
+            found, expected = complete_rows(part, name, last), complete_rows(whole, name, last)
             if name == "passages":
                 found, expected = unsettled(found), unsettled(expected)
             assert_frame_equal(found, expected, check_exact=True)

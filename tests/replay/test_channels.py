@@ -172,12 +172,12 @@ def test_compared_after_the_fact_is_what_the_monitor_sees():
     faulty, site = journey(OFFSET)
     sound, _ = journey(seed=9)
     run = two(faulty, sound)
-    seen = replay(run, site, VEHICLE, with_reference("galileo")).epochs
-    fails = seen.filter((pl.col("solution") == "primary") & (pl.col("channel_state") == "fail"))
+    rows = replay(run, site, VEHICLE, with_reference("galileo")).epochs
+    fails = rows.filter((pl.col("solution") == "primary") & (pl.col("channel_state") == "fail"))
     tallies = side_by_side(*_tables(replay(run, site, VEHICLE)), Configuration())
-    judged = seen.filter((pl.col("solution") == "primary") & (pl.col("channel_state") != "not_evaluated"))
+    judged = rows.filter((pl.col("solution") == "primary") & (pl.col("channel_state") != "not_evaluated"))
     composite = tallies.row(by_predicate=pl.col("architecture") == COMPOSITE, named=True)
-    assert composite["delays_s"] == pytest.approx([(fails["t"][0] - seen["t"][0]).total_seconds() - 150.0])
+    assert composite["delays_s"] == pytest.approx([(fails["t"][0] - rows["t"][0]).total_seconds() - 150.0])
     # Neither the alarm nor the recovery after it is time in use.
     alarm_s = (fails["t"][-1] - fails["t"][0]).total_seconds() + 30.0
     # In the first second no track is claimed yet.

@@ -51,8 +51,8 @@ def test_odometer_alone_finds_what_exceeds_its_confidence():
     logs = kinds_of(run)
     assert rows(replay(logs["odometer"], site, VEHICLE)) == rows(replay(run, site, VEHICLE))
     ramp, _ = journey({**EARLY, "rate_mps": 5.0})
-    seen = rows(replay(kinds_of(ramp)["odometer"], site, VEHICLE))
-    assert [row[0] for row in seen] == ["VB_SHIFT"]
+    hazards = rows(replay(kinds_of(ramp)["odometer"], site, VEHICLE))
+    assert [row[0] for row in hazards] == ["VB_SHIFT"]
 
 
 def test_odometer_alone_does_not_see_an_offset_within_its_confidence_and_says_so():
@@ -89,13 +89,13 @@ def test_balises_accepted_while_no_odometer_could_contradict_are_reported():
     middle = begin + timedelta(seconds=100)
     for kept, word in ((pl.col("t") < middle, "begins +0 s and ends -"), (pl.col("t") > middle, "begins +100 s")):
         part = replay(run.with_streams(odometer=run.odometer.filter(kept)), site, VEHICLE)
-        unseen = part.passages.filter(
+        undiagnosed_passages = part.passages.filter(
             (pl.col("kind") == "virtual") & (pl.col("status") == "accepted"),
             (pl.col("t_offered") >= middle) if "ends" in word else (pl.col("t_offered") <= middle),
         )
-        assert unseen.height > 0
+        assert undiagnosed_passages.height > 0
         notes = part.runs["notes"].item()
-        assert f"{unseen.height} {undiagnosed} (outside the odometer's time span): a jump" in notes
+        assert f"{undiagnosed_passages.height} {undiagnosed} (outside the odometer's time span): a jump" in notes
         assert f"the odometer {word}" in notes
 
 
@@ -150,15 +150,15 @@ def test_slide_as_quick_as_a_jump_between_two_reads_leaves_errors_unknown():
     assert not unknown["lds_state"].is_in(["P0", "P1"]).any()
 
 
-@pytest.mark.parametrize(("size_m", "seen"), [(300.0, True), (-300.0, True), (60.0, True), (-60.0, False)])
-def test_a_jump_beside_a_slip_is_wrong_where_the_slip_cannot_account_for_it(size_m, seen):
+@pytest.mark.parametrize(("size_m", "detected"), [(300.0, True), (-300.0, True), (60.0, True), (-60.0, False)])
+def test_a_jump_beside_a_slip_is_wrong_where_the_slip_cannot_account_for_it(size_m, detected):
     """The odometer slips by 120 m between two reads: anything less may as well be the odometer's."""
     step = {"kind": "step", "size_m": size_m, "at_m": 4260.0 if size_m > 0 else 4330.0, "duration_s": 10.0}
     slip = {"kind": "slip", "rate_mps": 30.0, "start_s": 188.0, "duration_s": 4.0}
     run, site = journey(slip, step, gnss={"velocity": False})
     by_reference, by_reads = replay(run, site, VEHICLE), replay(kinds_of(run)["balise"], site, VEHICLE)
     assert rows(by_reference)
-    assert bool(rows(by_reads)) is seen
+    assert bool(rows(by_reads)) is detected
     assert by_reads.runs["verdict"].item() != "safe"
 
 

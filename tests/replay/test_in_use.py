@@ -20,7 +20,7 @@ from tests.stages.matching.ladder import degrees
 
 RATE_HZ = 10.0
 TIME_S = np.arange(0.0, 140.0, 1.0 / RATE_HZ)
-WAY_M = 200.0 + 30.0 * np.clip(TIME_S - 5.0, 0.0, None)
+CHAINAGE_M = 200.0 + 30.0 * np.clip(TIME_S - 5.0, 0.0, None)
 KNOWN = Vehicle(odometer_scale=1.0, odometer_scale_sigma=1e-4, gnss_latency_s=0.0, gnss_latency_sigma_s=0.005)
 COMPLETE = Configuration.model_validate({"evidence": {"survey_complete": True}})
 
@@ -42,17 +42,19 @@ SITE = Site(
 )
 
 
-def gnss(error_m, way_m=WAY_M):
-    noise_m = 0.3 * np.convolve(np.random.default_rng(5).standard_normal(way_m.size), np.ones(200) / 200.0**0.5, "same")
-    return stream(Gnss, builders.run(way_m + error_m + noise_m, np.zeros(way_m.size), RATE_HZ))
-
-
-def reference(keep=slice(None), aside_m: float = 0.0, way_m=WAY_M, sigma_m: float = 0.05):
-    latitude, longitude = degrees(way_m, np.full(way_m.size, aside_m))
-    frame = pl.DataFrame(
-        {"t": builders.times(way_m.size, RATE_HZ), "latitude_deg": latitude, "longitude_deg": longitude}
+def gnss(error_m, chainage_m=CHAINAGE_M):
+    noise_m = 0.3 * np.convolve(
+        np.random.default_rng(5).standard_normal(chainage_m.size), np.ones(200) / 200.0**0.5, "same"
     )
-    kept = np.zeros(way_m.size, dtype=bool)
+    return stream(Gnss, builders.run(chainage_m + error_m + noise_m, np.zeros(chainage_m.size), RATE_HZ))
+
+
+def reference(keep=slice(None), aside_m: float = 0.0, chainage_m=CHAINAGE_M, sigma_m: float = 0.05):
+    latitude, longitude = degrees(chainage_m, np.full(chainage_m.size, aside_m))
+    frame = pl.DataFrame(
+        {"t": builders.times(chainage_m.size, RATE_HZ), "latitude_deg": latitude, "longitude_deg": longitude}
+    )
+    kept = np.zeros(chainage_m.size, dtype=bool)
     kept[keep] = True
     return stream(Reference, frame.with_columns(sigma_m=sigma_m).filter(pl.Series(kept)))
 
@@ -81,7 +83,7 @@ def test_rows_without_a_position_change_no_time_in_use(every: int, driven: bool)
     written = gnss(30.0 * ((TIME_S > 55.45) & (TIME_S < 59.55)))
     places = [pl.when(at_position).then(pl.col(name)).alias(name) for name in ("latitude_deg", "longitude_deg")]
     fix = pl.when(at_position).then(pl.col("fix").cast(pl.String)).otherwise(pl.lit("none"))
-    others = {"reference": reference(), "odometer": counted(WAY_M - 200.0) if driven else None}
+    others = {"reference": reference(), "odometer": counted(CHAINAGE_M - 200.0) if driven else None}
     logs = [
         written.filter(at_position),
         written.with_columns(places),
@@ -97,7 +99,7 @@ def test_rows_without_a_position_change_no_time_in_use(every: int, driven: bool)
 
 @pytest.mark.parametrize("step", [9, 12, 20])
 def test_unknown_time_of_a_thinned_log_counts(step: int):
-    """After 60 s the reference ends and few positions are left, which drift away unseen."""
+    """After 60 s the reference ends and few positions are left, which drift away undetected."""
     kept = pl.Series((TIME_S < 60.0) | (np.arange(TIME_S.size) % step == 0))
     log = gnss(np.clip(TIME_S - 65.0, 0.0, 60.0)).filter(kept)
     found = row(replay(RunLog("thin", log, reference=reference(slice(0, 600))), SITE))
@@ -108,7 +110,7 @@ def test_unknown_time_of_a_thinned_log_counts(step: int):
 @pytest.mark.parametrize("aside_m", [8.0, 12.0])
 def test_a_reference_beside_every_track_tells_nothing(aside_m: float):
     log = RunLog("aside", gnss(np.zeros(TIME_S.size)), reference=reference(aside_m=aside_m, sigma_m=0.1))
-    tables = replay(log.with_streams(odometer=counted(WAY_M - 200.0)), SITE)
+    tables = replay(log.with_streams(odometer=counted(CHAINAGE_M - 200.0)), SITE)
     assert row(tables)["verdict"] == "unproven"
     assert "right" not in tables.epochs["judgement"].cast(pl.String).to_list()
 
@@ -116,9 +118,9 @@ def test_a_reference_beside_every_track_tells_nothing(aside_m: float):
 def test_errors_are_signed_by_the_train_and_not_by_the_odometer():
     """An odometer that counts up while the train reverses; from the turn on the position is 40 m ahead."""
     speed = np.interp(np.arange(0.0, 200.0, 0.1), [0, 5, 45, 85, 100, 120, 160, 200], [0, 0, 20, 20, 0, 0, -15, -15])
-    way_m = 800.0 + np.cumsum(speed) / RATE_HZ
-    ahead = np.where(np.arange(way_m.size) < 1250, 0.0, -40.0)
-    log = RunLog("turns", gnss(ahead, way_m), reference=reference(way_m=way_m))
+    chainage_m = 800.0 + np.cumsum(speed) / RATE_HZ
+    ahead = np.where(np.arange(chainage_m.size) < 1250, 0.0, -40.0)
+    log = RunLog("turns", gnss(ahead, chainage_m), reference=reference(chainage_m=chainage_m))
     wrong = [
         replay(
             log.with_streams(odometer=counted(np.cumsum(np.abs(speed) if up else speed) / RATE_HZ)), SITE
@@ -141,8 +143,8 @@ class TestReadsThatNoTrainCanMake:
     )  # fmt: skip
 
     def replayed(self, *reads: tuple[str, float]) -> RunTables:
-        log = RunLog("reads", gnss(np.zeros(TIME_S.size)), odometer=counted(WAY_M - 200.0))
-        stamps = [5.0 + (way_m - 200.0) / 30.0 for _, way_m in reads]
+        log = RunLog("reads", gnss(np.zeros(TIME_S.size)), odometer=counted(CHAINAGE_M - 200.0))
+        stamps = [5.0 + (chainage_m - 200.0) / 30.0 for _, chainage_m in reads]
         t = pl.Series("t", np.round(1e9 * np.array(stamps)).astype(np.int64)).cast(pl.Datetime("ns", "UTC"))
         frame = pl.DataFrame([t, pl.Series("balise_id", [name for name, _ in reads])])
         site = Site(self.BOTH.track, self.BOTH.links, balises=self.BALISES)
@@ -156,8 +158,8 @@ class TestReadsThatNoTrainCanMake:
     @pytest.mark.parametrize("apart_m", [0.0, 1.0, 30.0])
     def test_a_read_of_the_other_track_leaves_the_gaps_around_it_unknown(self, apart_m: float):
         tables = self.replayed(("A", 1000.0), ("B", 2500.0), ("X", 2500.0 + apart_m), ("C", 4000.0))
-        way_m = 200.0 + 30.0 * (tables.epochs["t"].dt.timestamp("ns") / 1e9 - 5.0)
-        between = tables.epochs.filter((way_m > 1001.0) & (way_m < 3999.0))
+        chainage_m = 200.0 + 30.0 * (tables.epochs["t"].dt.timestamp("ns") / 1e9 - 5.0)
+        between = tables.epochs.filter((chainage_m > 1001.0) & (chainage_m < 3999.0))
         assert between.height > 900
         assert set(between["judgement"].cast(pl.String)) == {"unknown"}
         assert (row(tables)["unsafe_accepted"], row(tables)["odometer_contradicted"]) == (0, 0)
@@ -169,11 +171,13 @@ def test_a_lag_between_reference_and_odometer_belongs_to_nobody():
     speed = np.interp(
         np.arange(0.0, 240.0, 0.1), [0, 5, 40, 80, 110, 150, 180, 230, 240], [0, 0, 35, 35, 15, 35, 35, 0, 0]
     )
-    way_m = 200.0 + np.cumsum(speed) / RATE_HZ
-    log = RunLog("clocks", gnss(np.zeros(way_m.size), way_m), odometer=counted(way_m - 200.0))
+    chainage_m = 200.0 + np.cumsum(speed) / RATE_HZ
+    log = RunLog("clocks", gnss(np.zeros(chainage_m.size), chainage_m), odometer=counted(chainage_m - 200.0))
     verdicts = {}
     for late_s in (0.0, 0.4):
-        truth = reference(way_m=way_m).with_columns(pl.col("t") + pl.duration(milliseconds=round(1000 * late_s)))
+        truth = reference(chainage_m=chainage_m).with_columns(
+            pl.col("t") + pl.duration(milliseconds=round(1000 * late_s))
+        )
         tables = [replay(log.with_streams(reference=truth), SITE, vehicle, COMPLETE) for vehicle in (KNOWN, Vehicle())]
         verdicts[late_s] = [row(found)["verdict"] for found in tables]
         widest_m = [(found.epochs["error_high_m"] - found.epochs["error_low_m"]).max() for found in tables]
@@ -193,7 +197,7 @@ def test_reads_cut_to_whole_seconds_prove_nothing(cut: bool, verdict: str):
         pl.Datetime("ns", "UTC")
     )
     reads = stream(BaliseReads, pl.DataFrame([t, pl.Series("balise_id", names)]))
-    log = RunLog("cut", gnss(np.zeros(WAY_M.size)), odometer=counted(WAY_M - 200.0), balise_reads=reads)
+    log = RunLog("cut", gnss(np.zeros(CHAINAGE_M.size)), odometer=counted(CHAINAGE_M - 200.0), balise_reads=reads)
     found = row(replay(log, site, KNOWN, COMPLETE))
     assert found["verdict"] == verdict
     assert ("are whole seconds" in (found["notes"] or "")) == cut
@@ -214,7 +218,7 @@ def test_two_positions_of_one_stamp_prove_nothing():
     clean = gnss(np.zeros(TIME_S.size))
     twice = gnss(np.full(TIME_S.size, 40.0)).filter(pl.Series((TIME_S > 60.0) & (TIME_S < 64.0)))
     both = pl.concat([clean, twice]).sort("t", maintain_order=True)
-    log = RunLog("twice", both, odometer=counted(WAY_M - 200.0), reference=reference())
+    log = RunLog("twice", both, odometer=counted(CHAINAGE_M - 200.0), reference=reference())
     assert row(replay(log.with_streams(gnss=clean), SITE, KNOWN))["verdict"] == "safe"
     assert row(replay(log, SITE, KNOWN))["verdict"] == "unproven"
 
@@ -247,19 +251,19 @@ def test_a_fault_behind_a_gap_may_be_as_old_as_the_gap(gap_s: float):
     """40 m ahead behind a gap at 60 s, found at its first epoch, negated one later: since 59.9 s wrong in use."""
     kept = pl.Series((TIME_S < 60.0) | (60.0 + gap_s <= TIME_S))
     log = gnss(40.0 * (TIME_S >= 60.0)).filter(kept)
-    log = RunLog("gap", log, odometer=counted(WAY_M - 200.0), reference=reference())
+    log = RunLog("gap", log, odometer=counted(CHAINAGE_M - 200.0), reference=reference())
     tables = replay(log, SITE, KNOWN)
     assert row(tables)["failure_hazardous_s"] == [pytest.approx(gap_s + 0.2, abs=0.01)]
     assert row(tables)["failures_within_budget"] == (1 if gap_s == 0.3 else 0)
     assert (row(tables)["verdict"] == "unsafe") == (gap_s > 0.3)
 
 
-@pytest.mark.parametrize(("rate_mps", "seen_s"), [(0.5, 110.0), (3.0, 50.1)])
-def test_a_drift_has_its_time_from_failure_to_detection(rate_mps: float, seen_s: float):
+@pytest.mark.parametrize(("rate_mps", "detected_s"), [(0.5, 110.0), (3.0, 50.1)])
+def test_a_drift_has_its_time_from_failure_to_detection(rate_mps: float, detected_s: float):
     """Off from 50 s on, no average looks on: a slow one is seen at a jump; T_dsf is given as an interval."""
     drift = np.clip(rate_mps * (TIME_S - 50.0), 0.0, None)
     jump = np.where(TIME_S >= 110.0, 60.0, 0.0)
-    log = RunLog("drift", gnss(drift + jump), odometer=counted(WAY_M - 200.0), reference=reference(sigma_m=1.0))
+    log = RunLog("drift", gnss(drift + jump), odometer=counted(CHAINAGE_M - 200.0), reference=reference(sigma_m=1.0))
     averages = [f"{axis}_ewma_{scale}" for axis in ("along", "cross", "up") for scale in ("0p1", "0p01", "0p001")]
     blind = Configuration.model_validate({"monitors": {"disabled": [*averages, "link_distance", "along_doppler"]}})
     hazards = replay(log, SITE, KNOWN, blind).hazards.filter(pl.col("hazard").cast(pl.String) == "VB_SHIFT")
@@ -267,8 +271,8 @@ def test_a_drift_has_its_time_from_failure_to_detection(rate_mps: float, seen_s:
     # Beyond 20 m at 50 s + 20 m / rate; certain or possible so much later or earlier: 3 sigma of the reference, and at
     # one speed the clock is assumed, 0.1 s.
     half_m = 3.0 * 1.0 + 0.1 * 30.0
-    assert least_s == pytest.approx(seen_s - 50.0 - (20.0 + half_m) / rate_mps, abs=1.0)
-    assert most_s == pytest.approx(seen_s - 50.0 - (20.0 - half_m) / rate_mps, abs=1.5)
+    assert least_s == pytest.approx(detected_s - 50.0 - (20.0 + half_m) / rate_mps, abs=1.0)
+    assert most_s == pytest.approx(detected_s - 50.0 - (20.0 - half_m) / rate_mps, abs=1.5)
 
 
 @pytest.mark.parametrize("driven", [True, False], ids=["odometer", "no_odometer"])
@@ -276,7 +280,7 @@ def test_the_share_of_p1_is_the_hazardous_time(driven: bool):
     """Two faults; of the gap of 5 s in the first no more counts than of a step of a second."""
     kept = pl.Series(~((TIME_S > 70.0) & (TIME_S < 75.0)))
     wrong = 50.0 * ((TIME_S > 60.0) & (TIME_S < 80.0)) + 30.0 * (TIME_S > 110.0)
-    odometer = {"odometer": counted(WAY_M - 200.0)} if driven else {}
+    odometer = {"odometer": counted(CHAINAGE_M - 200.0)} if driven else {}
     tables = replay(RunLog("p1", gnss(wrong).filter(kept), reference=reference(), **odometer), SITE, KNOWN)
     share, held_s, hazardous_s = of(tables, "share_p1", "held_s", "hazardous_s")
     assert share * held_s == pytest.approx(hazardous_s)
@@ -286,7 +290,7 @@ def test_the_share_of_p1_is_the_hazardous_time(driven: bool):
 def test_a_part_between_the_anchors_has_its_own_verdict():
     """The reference is silent before 30 s and after 110 s: 300 m on, the odometer's 5 m + 5 % reach the limit."""
     log = RunLog(
-        "part", gnss(np.zeros(TIME_S.size)), odometer=counted(WAY_M - 200.0), reference=reference(slice(300, 1101))
+        "part", gnss(np.zeros(TIME_S.size)), odometer=counted(CHAINAGE_M - 200.0), reference=reference(slice(300, 1101))
     )
     tables = replay(log, SITE, None, COMPLETE)
     assert of(tables, "verdict", "part_verdict") == ("unproven", "safe")

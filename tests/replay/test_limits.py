@@ -84,9 +84,9 @@ CASES: dict[str, tuple[list[dict[str, Any]], dict[str, Any], float, set[str]]] =
     "moved_m": ([], {"vehicle": None, "rows_lost_s": (100.0, 103.0)}, 0.1, {"epochs.along_raw_threshold"}),
     "abreast_m": ([STEP], {}, 2.0, {"epochs.error_cross_m", "epochs.error_up_m", "runs.cross_error_epochs"}),
 }
-"""Faults, world, factor of the limit, and what must move among `SEEN`: tables by name where rows come or go."""
+"""Faults, world, factor of the limit, and what must move among `COMPARED`: tables by name where rows come or go."""
 
-SEEN = (
+COMPARED = (
     *("epochs.judgement", "epochs.evidence", "epochs.alarm", "epochs.error_cross_m", "epochs.error_up_m"),
     *("epochs.along_raw_threshold", "hazards.hazardous_may_s", "hazards.suspect", "alarms.suspect"),
     *("runs.proof_margin_m", "runs.availability", "runs.hazards_shift", "runs.hazards_1b"),
@@ -97,7 +97,7 @@ SEEN = (
 def _moved(before: RunTables, after: RunTables) -> set[str]:
     tables = {name: (getattr(before, name), getattr(after, name)) for name in ("epochs", "hazards", "alarms", "runs")}
     resized = {name for name, (old, new) in tables.items() if old.height != new.height}
-    columns = (name for name in SEEN if name.split(".")[0] not in resized)
+    columns = (name for name in COMPARED if name.split(".")[0] not in resized)
     pairs = ((name, *(frame[name.split(".")[1]] for frame in tables[name.split(".")[0]])) for name in columns)
     return resized | {name for name, old, new in pairs if not old.equals(new, null_equal=True)}
 

@@ -31,17 +31,17 @@ def lengths(points):
     return np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(points, axis=0).T))])
 
 
-def journey(points, way_m, rounds, links, measures, error_m=0.0):
+def journey(points, chainage_m, rounds, links, measures, error_m=0.0):
     """Points of element `r` run along `rounds` times; balises at `measures`."""
     along = lengths(points)
-    at = np.mod(way_m, along[-1]) if rounds > 1 else way_m
+    at = np.mod(chainage_m, along[-1]) if rounds > 1 else chainage_m
     x, y = np.interp(at, along, points[:, 0]), np.interp(at, along, points[:, 1])
-    noise = np.random.default_rng(4).standard_normal((3, way_m.size))
+    noise = np.random.default_rng(4).standard_normal((3, chainage_m.size))
     slow = [0.4 * np.convolve(part, np.ones(200) / 200.0**0.5, "same") for part in noise[:2]]
-    shifted = np.mod(way_m + error_m, along[-1]) if rounds > 1 else way_m + error_m
+    shifted = np.mod(chainage_m + error_m, along[-1]) if rounds > 1 else chainage_m + error_m
     gx, gy = np.interp(shifted, along, points[:, 0]), np.interp(shifted, along, points[:, 1])
     gnss = stream(Gnss, builders.run(gx + slow[0], gy + slow[1], RATE_HZ))
-    odometer = stream(Odometer, builders.odometer(way_m + 0.05 * np.cumsum(noise[2]) / RATE_HZ**0.5, RATE_HZ))
+    odometer = stream(Odometer, builders.odometer(chainage_m + 0.05 * np.cumsum(noise[2]) / RATE_HZ**0.5, RATE_HZ))
     truth = builders.run(x, y, RATE_HZ, sigma_m=None).select("t", "latitude_deg", "longitude_deg", "height_m")
     bare = builders.site({"r": points}, links)
     balises = pl.DataFrame({"balise_id": [f"V{i}" for i in range(len(measures))], "measure_m": measures}).with_columns(

@@ -7,12 +7,12 @@ from typing import Any
 import numpy as np
 import polars as pl
 import pytest
-from schemas.monitors import BANK_MONITORS
 
 from pipeline.stages.track.geodesy import SEMI_MAJOR_AXIS_M
 from schemas.arrays import floats, times_ns
 from schemas.config import Vehicle
 from schemas.enums import NotEvaluated, Origin
+from schemas.monitors import BANK_MONITORS
 from schemas.run import RunLog, RunTables
 from schemas.words import verdict_figures_words
 from tests.replay.journeys import VEHICLE, journey, replay

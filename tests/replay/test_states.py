@@ -28,9 +28,9 @@ def test_odometer_error_beyond_5_m_and_5_percent_since_the_lrvb_is_p3():
     # Without the reads, which such an odometer carries to where the reference is not.
     tables = states(WORN, ADMITTED, disabled=["link_distance"], reads=False)
     epochs = tables.epochs.filter(pl.col("distance_from_lrvb_m").is_not_null() & (pl.col("lds_mode") == "linked"))
-    way_m = pl.col("distance_from_lrvb_m")
+    chainage_m = pl.col("distance_from_lrvb_m")
     # Both ends of the way are known by the reference to a metre or so, most of it for its clock.
-    within, beyond = epochs.filter(way_m < BEYOND_M - 15.0), epochs.filter(way_m > BEYOND_M + 130.0)
+    within, beyond = epochs.filter(chainage_m < BEYOND_M - 15.0), epochs.filter(chainage_m > BEYOND_M + 130.0)
     assert min(within.height, beyond.height) > 400
     assert set(within["lds_state"]) == {"P0"}
     assert set(beyond["lds_state"]) == {"P3"}

@@ -22,9 +22,11 @@ def out(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("result")
     for k, run_id in enumerate(["a", "b c", "d=e"]):
         found = hazards(3 - k, hazard=KINDS[: 3 - k], size_m=[10.0 * j for j in range(3 - k)], solution="primary")
-        met = passages(1, solution="primary", balise_id="VB1", t_offered=[k * NS])
+        offered = passages(1, solution="primary", balise_id="VB1", t_offered=[k * NS])
         catalogue = table(Runs, 1, solution="primary", status="ok", duration_s=100.0 * k)
-        write_run(RunTables(run_id, found, met, alarms(), epochs([0, 1], solution="primary"), catalogue), folder, {})
+        write_run(
+            RunTables(run_id, found, offered, alarms(), epochs([0, 1], solution="primary"), catalogue), folder, {}
+        )
     return folder
 
 

@@ -20,7 +20,7 @@ def written(folder: Path, verdict: str = "unproven", failures: int = 0, accepted
     times = [0.0, 1.0, 2.0, 3.0, 4.0, 14.0, 15.0, 16.0, 17.0, 18.0]
     steps = [1.0, 1.0, 1.0, 1.0, 10.0, 1.0, 1.0, 1.0, 1.0, 0.0]
     lost = [0.0, 0.0, 0.0, 0.0, 10.0, 1.0, 1.0, 0.0, 1.0, 0.0]
-    seen = epochs(
+    epoch_rows = epochs(
         times,
         **PRIMARY,
         step_s=steps,
@@ -43,7 +43,7 @@ def written(folder: Path, verdict: str = "unproven", failures: int = 0, accepted
         time_since_failure_s=[-3.0, None, None],
         within_budget=[True, None, False],
     )
-    met = passages(
+    passage_rows = passages(
         4,
         **PRIMARY,
         balise_id=["VB1", "VB1", "VB2", "PB1"],
@@ -60,7 +60,7 @@ def written(folder: Path, verdict: str = "unproven", failures: int = 0, accepted
         Runs, 1, **PRIMARY, status="ok", verdict=verdict, moving_s=17.0, availability=4 / 17, lost_to=[["no_position"]],
         lost_to_share=[[10 / 17]], failures=failures, balises_accepted=accepted,
     )  # fmt: skip
-    write_run(RunTables("a", found, met, alarms(), seen, good), folder, {})
+    write_run(RunTables("a", found, passage_rows, alarms(), epoch_rows, good), folder, {})
     failed = table(Runs, 1, **PRIMARY, status="failed", error="damaged")
     write_run(RunTables("b", hazards(), passages(), alarms(), epochs([]), failed), folder, {})
     return folder

@@ -17,7 +17,7 @@ def _classes(decorate: Callable[[type], type]) -> tuple[Any, Any, Any]:
     class Point:
         x: float
         y: float = 2.0
-        seen: list[int] = field(default_factory=list, compare=False)
+        values: list[int] = field(default_factory=list, compare=False)
         _kept: dict[str, float] = field(default_factory=dict, init=False, repr=False, compare=False)
 
         @cached_property
@@ -86,7 +86,7 @@ CALLS: list[Callable[[Any, Any, Any], Any]] = [
     lambda point, named, nothing: delattr(point(1.0), "x"),
     lambda point, named, nothing: [each.name for each in fields(named)],
     lambda point, named, nothing: point.__match_args__,
-    lambda point, named, nothing: point(1.0).seen is point(1.0).seen,
+    lambda point, named, nothing: point(1.0).values is point(1.0).values,
 ]
 
 

@@ -39,18 +39,18 @@ def test_every_other_kind_of_columns_is_asked_for() -> None:
 
 
 def test_a_damaged_file_among_others_is_an_error() -> None:
-    """Of the bytes of its first page none may change a value unseen."""
-    good, seen = parquet_bytes(FRAMES[0]), 0
+    """Of the bytes of its first page none may change a value undetected."""
+    good, refused = parquet_bytes(FRAMES[0]), 0
     for place in range(4, 60):
         reader = TableReader()
         reader.add(parquet_bytes(FRAMES[1]))
         try:
             reader.add(good[:place] + bytes([good[place] ^ 1]) + good[place + 1 :])
         except ParquetError:
-            seen += 1
+            refused += 1
         else:
             assert reader.frame().equals(pl.concat([FRAMES[1], FRAMES[0]]))
-    assert seen > 40
+    assert refused > 40
 
 
 def test_no_columns_are_rows_all_the_same(tmp_path: Path) -> None:

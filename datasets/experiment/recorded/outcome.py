@@ -9,7 +9,6 @@ from dataclasses import replace
 
 import numpy as np
 import polars as pl
-from schemas.monitors import MONITORS, SCALES
 
 from datasets.experiment.recorded.baseline import Baseline, Onset, instant
 from datasets.experiment.tables import Row
@@ -25,6 +24,7 @@ from pipeline.studies.plausibility.fit import clock_advice
 from schemas.arrays import NS_PER_S, Bools, Floats, Ints, flags, floats, ints, runs_of
 from schemas.errors import InputError
 from schemas.frozen import frozen
+from schemas.monitors import MONITORS, SCALES
 from schemas.run import RunLog
 
 # Epochs before the onset that the time in use is reckoned from: a negation in force there has no part in it.

@@ -16,7 +16,7 @@ from schemas.enums import Fix
 
 Columns = dict[str, Any]
 
-_UNRESOLVED = "time not yet resolved by the receiver (kept as it is told)"
+_UNRESOLVED = "time not yet resolved by the receiver (kept as stated)"
 _WEEK_MS = 604_800_000
 _LEAP_NS = 60 * NS_PER_S  # leap seconds and more: what is farther off is of another week
 
@@ -58,7 +58,7 @@ def decode(gathered: Gathered, message: Any, raw: bytes) -> None:
 def settle_times(gathered: Gathered) -> None:
     """UTC of epochs that the receiver had not resolved yet: the time of the week goes on from the next that it had.
 
-    Where it never had, times stay as they are told, and are counted as what they are.
+    Where it never had, times stay as they are stated, and are counted as what they are.
     """
     resolved = 0
     for epochs in (gathered.epochs[::-1], gathered.epochs):

@@ -122,14 +122,14 @@ def _without_repeated_stretches(
     pieces: list[LinePiece], nodes: list[Ints], survey: Survey
 ) -> tuple[list[LinePiece], list[Ints]]:
     """Pieces with each stretch between two nodes once: the first line that has it keeps it."""
-    seen: set[tuple[int, int]] = set()
+    known: set[tuple[int, int]] = set()
     kept = []
     kept_nodes = []
     for piece, piece_nodes in zip(pieces, nodes, strict=True):
         edges = [(min(ends), max(ends)) for ends in itertools.pairwise(piece_nodes.tolist())]
-        new = np.array([edge not in seen and edge[0] != edge[1] for edge in edges])
-        doubled = sum(edge in seen for edge in edges)
-        seen.update(edges)
+        new = np.array([edge not in known and edge[0] != edge[1] for edge in edges])
+        doubled = sum(edge in known for edge in edges)
+        known.update(edges)
         if doubled:
             text = f"{doubled} of its {len(edges)} segments stand in the survey already and are left out"
             survey.report("warning", f"track: {piece.name}", text, "Look whether one track was given twice.")

@@ -152,7 +152,7 @@ def _summary(stream: Stream, frame: pl.DataFrame) -> StreamSummary:
 
 @dataclass
 class _ChannelCounts:
-    """What the walk has met of one channel."""
+    """What the walk has counted of one channel."""
 
     channel: Channel
     fields: Mapping[str, str]
@@ -164,17 +164,17 @@ class Census:
     """Counts messages of all channels and looks at the first of each."""
 
     def __init__(self) -> None:
-        self.met: dict[int, _ChannelCounts] = {}
+        self.counts: dict[int, _ChannelCounts] = {}
 
     def add(self, block: Block, channels: Mapping[int, Channel]) -> None:
         for channel_id, messages in block.items():
-            if channel_id not in self.met:
-                fields = _fields(channels[channel_id], messages) if len(self.met) < _MOST_SAMPLES else {}
-                self.met[channel_id] = _ChannelCounts(channels[channel_id], fields)
-            met = self.met[channel_id]
+            if channel_id not in self.counts:
+                fields = _fields(channels[channel_id], messages) if len(self.counts) < _MOST_SAMPLES else {}
+                self.counts[channel_id] = _ChannelCounts(channels[channel_id], fields)
+            counts = self.counts[channel_id]
             times = messages.log_time
-            met.messages += len(messages)
-            met.span_ns += [int(times.min()), int(times.max())]
+            counts.messages += len(messages)
+            counts.span_ns += [int(times.min()), int(times.max())]
 
 
 def _fields(channel: Channel, messages: Messages) -> Mapping[str, str]:
@@ -195,13 +195,13 @@ def topics_of(paths: Sequence[Address], config: IngestConfig) -> tuple[TopicSumm
 def topics_in(logs: Sequence[Census], config: IngestConfig) -> tuple[TopicSummary, ...]:
     """All topics that were counted, in one or several files of a log."""
     if len(logs) == 1:
-        return tuple(_topic(logs[0].met[channel_id], config) for channel_id in sorted(logs[0].met))
+        return tuple(_topic(logs[0].counts[channel_id], config) for channel_id in sorted(logs[0].counts))
     joined: dict[tuple[str, str, str], _ChannelCounts] = {}
-    for met in (met for census in logs for met in census.met.values()):
-        key = (met.channel.topic, met.channel.schema_name, met.channel.encoding)
-        before = joined.setdefault(key, _ChannelCounts(met.channel, met.fields))
-        before.messages += met.messages
-        before.span_ns += met.span_ns
+    for counted in (counted for census in logs for counted in census.counts.values()):
+        key = (counted.channel.topic, counted.channel.schema_name, counted.channel.encoding)
+        before = joined.setdefault(key, _ChannelCounts(counted.channel, counted.fields))
+        before.messages += counted.messages
+        before.span_ns += counted.span_ns
     return tuple(_topic(joined[key], config) for key in sorted(joined))
 
 
@@ -212,10 +212,10 @@ def _census_of(path: Address, config: IngestConfig) -> Census:
     return census
 
 
-def _topic(met: _ChannelCounts, config: IngestConfig) -> TopicSummary:
-    sample = Sample(met.channel, met.fields)
-    span_s = (max(met.span_ns) - min(met.span_ns)) / 1e9
-    sources = sources_of(sample, config) if met.fields else []
+def _topic(counted: _ChannelCounts, config: IngestConfig) -> TopicSummary:
+    sample = Sample(counted.channel, counted.fields)
+    span_s = (max(counted.span_ns) - min(counted.span_ns)) / 1e9
+    sources = sources_of(sample, config) if counted.fields else []
     source = next((source for source in sources if not source.dropped), None)
     mapping = {}
     if source is not None:
@@ -225,14 +225,14 @@ def _topic(met: _ChannelCounts, config: IngestConfig) -> TopicSummary:
             for name, expression in source.columns.items()
         }
     return TopicSummary(
-        topic=met.channel.topic,
-        schema=met.channel.schema_name,
-        encoding=met.channel.encoding,
-        messages=met.messages,
-        rate_hz=(met.messages - 1) / span_s if span_s > 0 else None,
+        topic=counted.channel.topic,
+        schema=counted.channel.schema_name,
+        encoding=counted.channel.encoding,
+        messages=counted.messages,
+        rate_hz=(counted.messages - 1) / span_s if span_s > 0 else None,
         stream=source.recipe.stream if source else None,
         mapping=mapping,
-        fields=met.fields,
+        fields=counted.fields,
         remark=source.recipe.remark if source else "",
     )
 

@@ -81,15 +81,15 @@ def fields_of(channel: Channel, messages: Messages) -> dict[str, str]:
     """Field paths of the first message, of JSON those of the first ones, with their kind: `int`, `float`, `text`,
     `flag`, `null`.
     """
-    met: dict[str, str] = {}
+    fields: dict[str, str] = {}
     few = int((messages.length[:_SAMPLED].cumsum() < _SAMPLED_BYTES).sum()) if channel.encoding == "json" else 1
     for row in range(max(few, 1)):
         try:
             found = dict(_fields(channel, messages.payload(row)))
         except UndecodableError as error:
             raise undecodable(channel, messages.log_time[row], error) from None
-        met |= {path: kind for path, kind in found.items() if met.get(path, "null") == "null"}
-    return met
+        fields |= {path: kind for path, kind in found.items() if fields.get(path, "null") == "null"}
+    return fields
 
 
 def _fields(channel: Channel, payload: bytes) -> Iterator[tuple[str, str]]:

@@ -50,7 +50,7 @@ def known_zones() -> frozenset[str]:
 def zone_in(name: str) -> tuple[str | None, str]:
     """The zone that the name of a time tells, None for UTC and none, and the name without it.
 
-    A zone is told by its name (`Europe/Berlin`), by an offset (`UTC+2`), by letters (`CEST`) or by a word (`local`).
+    A zone is given by its name (`Europe/Berlin`), by an offset (`UTC+2`), by letters (`CEST`) or by a word (`local`).
     """
     places = set(re.findall(r"[A-Z][A-Za-z]+/[A-Z][A-Za-z_]+", name)) & known_zones()
     if place := next(iter(sorted(places)), None):

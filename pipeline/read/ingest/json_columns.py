@@ -50,7 +50,7 @@ class JsonDecoder:
                 node = node.setdefault("[]" if isinstance(step, int) else step, {})
             node["[]" if isinstance(last, int) else last] = _ARROW[type(dtype)]
         self._schema = pa.schema(list(_struct(tree)))
-        self._met: pa.Schema | None = None  # what of it the first messages held, while no other has held more
+        self._first_schema: pa.Schema | None = None  # what of it the first messages held, while no other has held more
         self._narrow = True
         self._typed: TypedMessages | None = None  # while all messages hold what the first did
         self._is_first = True
@@ -101,25 +101,25 @@ class JsonDecoder:
 
     def _columns(self, table: pa.Table) -> Columns:
         frame = pl.DataFrame(pl.from_arrow(table))
-        met = {path: dtype for path, dtype in self._types.items() if parse_path(path)[0] in frame.columns}
-        columns: dict[str, Values] = {**frame.select(_value(path).alias(path) for path in met).to_dict()}
+        present = {path: dtype for path, dtype in self._types.items() if parse_path(path)[0] in frame.columns}
+        columns: dict[str, Values] = {**frame.select(_value(path).alias(path) for path in present).to_dict()}
         for path, dtype in self._types.items():
-            if path not in met:
+            if path not in present:
                 columns[path] = pl.Series([None], dtype=dtype).new_from_index(0, len(table))
         return columns
 
     def _parsed(self, content: bytearray) -> pa.Table:
         """Without the columns that the first messages lacked, as long as none has more: each costs a message time."""
-        if self._met is not None:
+        if self._first_schema is not None:
             try:
-                return _read(content, self._met, "error")
+                return _read(content, self._first_schema, "error")
             except pa.ArrowInvalid:
-                self._met = None
+                self._first_schema = None
         table = _read(content, self._schema, "ignore")
         if self._narrow:
             self._narrow = False
             filled = [field for field in self._schema if table[field.name].null_count < len(table)]
-            self._met = pa.schema(filled) if filled else None
+            self._first_schema = pa.schema(filled) if filled else None
         return table
 
 

@@ -68,12 +68,12 @@ class _Walk:
 
     def message(self, descriptor: Any, tree: Mapping[Any, Any], start: int, end: int) -> None:
         """The wanted fields of the message in this extent."""
-        met = self._scan(start, end)
+        extents = self._scan(start, end)
         for step, subtree in tree.items():
             field = descriptor.fields_by_name.get(step) if isinstance(step, str) else None
             if field is None:
                 raise UndecodableError(f"no field {step}")
-            places = met.get(field.number, [])
+            places = extents.get(field.number, [])
             if field.is_repeated:
                 self._elements(field, subtree, self._unpacked(field.type, places))
             elif len(places) > 1:
@@ -93,7 +93,7 @@ class _Walk:
 
     def _scan(self, at: int, end: int) -> dict[int, list[Raw]]:
         """All fields of one message by number; tags, lengths and widths of varints are marked as static."""
-        met: dict[int, list[Raw]] = {}
+        extents: dict[int, list[Raw]] = {}
         while at < end:
             tag, start = self._varint(at, end, 0xFF, _LONGEST_TAG)
             number = tag >> 3
@@ -109,8 +109,8 @@ class _Walk:
                 raise UndecodableError("a group or unknown wire type")
             if at > end or number == 0 or tag >> 32:
                 raise UndecodableError("a field runs past its message")
-            met.setdefault(number, []).append((wire, start, at))
-        return met
+            extents.setdefault(number, []).append((wire, start, at))
+        return extents
 
     def _varint(self, at: int, end: int, mask: int, longest: int = 10) -> tuple[int, int]:
         """Value and next offset; the mask fixes the value itself, or its width only."""

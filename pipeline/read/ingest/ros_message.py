@@ -48,14 +48,14 @@ _BUILT_IN = {"builtin_interfaces/Time": _TIME, "builtin_interfaces/Duration": _T
 @lru_cache(maxsize=64)  # the logs of a campaign share their schemas
 def parse_definitions(name: str, text: str) -> Mapping[str, Definition]:
     """All messages of a concatenated definition by short name (`pkg/Type`); constants are left out."""
-    met: dict[str, Definition] = {}
+    by_short_name: dict[str, Definition] = {}
     for full, lines in _sections(name, text):
         members = tuple(member for line in lines if (member := _member(line, full.split("/")[0])))
         if len({member.name for member in members}) < len(members):
             raise DefinitionError(f"{full} names a field twice")
-        if met.setdefault(short_name(full), members) != members:
+        if by_short_name.setdefault(short_name(full), members) != members:
             raise DefinitionError(f"{full} is defined twice with different content")
-    return _BUILT_IN | met
+    return _BUILT_IN | by_short_name
 
 
 def _sections(name: str, text: str) -> list[tuple[str, list[str]]]:

@@ -104,12 +104,12 @@ def _ahead(
 
     def on_chain(chain: Chain) -> tuple[_OnChain, ...]:
         entered = zip(chain.oriented, chain.entry_m, strict=True)
-        on_way = (
+        ahead = (
             (point, entry_m + point.at_m)
             for number, (here, entry_m) in enumerate(entered)
             for point in points.get(here, [])[0 if number else index + 1 :]
         )
-        return tuple(islice(on_way, 2))
+        return tuple(islice(ahead, 2))
 
     def onward(chain: Chain) -> list[Edge]:
         return [edge for edge in network.successors[chain.oriented[-1]] if edge.forward and len(on_chain(chain)) < 2]
@@ -169,7 +169,7 @@ def parallel_findings(site: Site, config: Configuration = _WHOLE) -> list[Findin
 
 
 class TrackResolution(NamedTuple):
-    """Per net element how far aside another track has to lie to be told from it with exact positions [m]."""
+    """Per net element how far aside another track has to lie to be distinguished from it with exact positions [m]."""
 
     survey_m: Floats
     by_offset_m: Floats

@@ -302,7 +302,7 @@ def _near_misses(
     free[np.concatenate(related)] = False
     places = end_places(track).reshape(-1, 3)
     inward = inward / np.maximum(np.linalg.norm(inward, axis=1), 1e-9)[:, None]
-    for end_a, end_b, gap in _nearly_met(places, inward, free, config):
+    for end_a, end_b, gap in _close_ends(places, inward, free, config):
         element_a, position_a = divmod(end_a, 2)
         element_b, position_b = divmod(end_b, 2)
         if element_a != element_b:
@@ -339,7 +339,7 @@ def _pairs_within(places: Floats, reach_m: float) -> npt.NDArray[np.int64]:
 _HALF_OF_THE_NEIGHBOURS = [step for step in itertools.product((-1, 0, 1), repeat=2) if step >= (0, 0)]
 
 
-def _nearly_met(places: Floats, inward: Floats, free: np.ndarray, config: SiteConfig) -> list[tuple[int, int, float]]:
+def _close_ends(places: Floats, inward: Floats, free: np.ndarray, config: SiteConfig) -> list[tuple[int, int, float]]:
     """Pairs of ends, and how far apart they are."""
     near = _pairs_within(places, config.near_ends_m)
     onward = np.einsum("ij,ij->i", inward[near[:, 0]], inward[near[:, 1]]) < 0.0

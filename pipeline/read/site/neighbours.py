@@ -24,7 +24,7 @@ _COLUMNS: dict[str, type[pl.DataType]] = {
     "offset_tells_from_m": pl.Float64,
     "switch_tells_from_m": pl.Float64,
 }
-# Tracks farther apart are told by any receiver whose accuracy is of use here [m].
+# Tracks farther apart are distinguished by any receiver whose accuracy is of use here [m].
 _NEIGHBOUR_M = 10.0
 # Distances are medians over so many places: surveys scatter about a limit.
 _PLACES = 5

@@ -64,15 +64,15 @@ def time_data(epochs: pl.DataFrame, moments_ns: Ints, gap_reset_s: float) -> Jso
 
 def _never_evaluated(epochs: pl.DataFrame, known: Collection[str]) -> dict[str, str]:
     """The most frequent reason for each drawing of monitors none of which was ever evaluated."""
-    silent = {}
+    never = {}
     for drawing, lines in monitor_lines().items():
         reasons = [epochs[f"{name}_reason"].cast(pl.String).alias("reason") for name, _ in lines]
         counts = (
             pl.concat(reasons).drop_nulls().value_counts(sort=True).sort("count", "reason", descending=[True, False])
         )
         if counts.height and not any(f"ratio_{name}" in known for name, _ in lines):
-            silent[drawing] = counts["reason"][0]
-    return silent
+            never[drawing] = counts["reason"][0]
+    return never
 
 
 def moments_of(*frames: pl.DataFrame) -> Ints:

@@ -9,12 +9,12 @@ from typing import Any, Self
 import numpy as np
 import numpy.typing as npt
 import polars as pl
-from schemas.monitors import MONITORS
 
 from schemas.arrays import NS_PER_S, Bools, Floats, Ints, Rows, floats, ints
 from schemas.config import LdsConfig
 from schemas.enums import MonitorState, NotEvaluated
 from schemas.frozen import frozen
+from schemas.monitors import MONITORS
 from schemas.stages import NO_REASON, REASONS, AlignedEpochs, LdsEpochs, reason_words
 
 # Reasons that several monitors give.

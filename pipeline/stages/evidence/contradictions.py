@@ -319,9 +319,9 @@ def levels_beyond(stretches: Sequence[Levels], steps_m: Sequence[float]) -> list
 def _levels_before_m(stretches: Sequence[Levels], steps_m: Sequence[float], back: bool) -> list[list[float]]:
     """The levels of all stretches before each, in this order, over its near end [m]."""
     behind: list[list[float]] = []
-    seen_levels_m: list[float] = []
+    levels_so_far_m: list[float] = []
     for number, levels in enumerate(stretches):
-        behind.append(list(seen_levels_m))
+        behind.append(list(levels_so_far_m))
         if number == len(steps_m):
             break
         heights_m = levels.heights_m[::-1] if back else levels.heights_m
@@ -332,10 +332,10 @@ def _levels_before_m(stretches: Sequence[Levels], steps_m: Sequence[float], back
         if confirmed.any():
             # What lies before a confirmed level says nothing here.
             own_m = heights_m[int(np.flatnonzero(confirmed)[-1]) :] - heights_m[-1]
-            seen_levels_m = []
+            levels_so_far_m = []
         rise_m = levels.rise_m * (-1.0 if back else 1.0)
-        seen_levels_m = [height_m - rise_m - steps_m[number] for height_m in seen_levels_m]
-        seen_levels_m += (own_m - steps_m[number]).tolist()
+        levels_so_far_m = [height_m - rise_m - steps_m[number] for height_m in levels_so_far_m]
+        levels_so_far_m += (own_m - steps_m[number]).tolist()
     # A reference without any step, and without a gap that does not close, leaves nothing open.
     return [list(dict.fromkeys(heights_m)) for heights_m in behind]
 

@@ -7,7 +7,6 @@ from dataclasses import replace
 
 import numpy as np
 import polars as pl
-from schemas.monitors import ALL_MONITORS
 
 from pipeline.stages.epochs.verdicts import AlarmEpisode, FailureLog
 from pipeline.stages.evidence.evidence import NOTHING
@@ -19,6 +18,7 @@ from schemas.config import Configuration, HazardConfig
 from schemas.conform import table_of_rows
 from schemas.enums import Suspect, Verdict
 from schemas.frozen import frozen
+from schemas.monitors import ALL_MONITORS
 from schemas.stages import MatchedEpochs
 from schemas.tables import Alarms
 

@@ -115,8 +115,8 @@ def _travel_direction(odometer_m: Floats, matched: Ints, turn_m: float) -> Ints:
         return _last_known(matched, matched != 0, 1)
     known = np.flatnonzero(np.isfinite(odometer_m))
     direction = np.ones(odometer_m.size, dtype=np.int64)
-    for _, seen_at, sense in turns_of(odometer_m[known], turn_m):
-        direction[known[seen_at] :] = sense
+    for _, turned_at, sense in turns_of(odometer_m[known], turn_m):
+        direction[known[turned_at] :] = sense
     return direction
 
 

@@ -7,7 +7,6 @@ from dataclasses import replace
 
 import numpy as np
 import polars as pl
-from schemas.monitors import SCALES
 
 from pipeline.stages.epochs.verdicts import (
     DISABLED,
@@ -28,6 +27,7 @@ from pipeline.stages.monitors.noise import OF_WALK, OF_WHITE_NOISE
 from schemas.arrays import Bools, Floats, Ints, rows_of
 from schemas.config import Configuration
 from schemas.enums import NotEvaluated
+from schemas.monitors import SCALES
 from schemas.stages import AlignedEpochs
 
 FIRST_EPOCH = NotEvaluated.FIRST_EPOCH

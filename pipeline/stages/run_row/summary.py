@@ -45,7 +45,6 @@ from schemas.conform import dtypes
 from schemas.enums import (
     NO_RELINK,
     BaliseKind,
-    Evidence,
     Note,
     NotEvaluated,
     PassageStatus,
@@ -56,7 +55,7 @@ from schemas.enums import (
 from schemas.frozen import frozen
 from schemas.run import IngestNotes, RunLog
 from schemas.tables import CONTRACT_VERSION, Runs
-from schemas.words import Remark, notes_text, remarks, remedy_words, say
+from schemas.words import EVIDENCE_LIMITS, Remark, notes_text, remarks, remedy_words, say
 
 # So many names stand in one note.
 _NAMED = 5
@@ -148,8 +147,7 @@ def judgement_notes(run: Mapping[str, Any]) -> list[Remark]:
     return remarks(
         {
             Note.NO_EVIDENCE: evidence is None,
-            Note.EVIDENCE_BALISE: evidence is Evidence.BALISE,
-            Note.EVIDENCE_ODOMETER: evidence is Evidence.ODOMETER,
+            Note.EVIDENCE: evidence and EVIDENCE_LIMITS[evidence],
             Note.UNKNOWN_SHARE: run["share_unknown"] if Reason.UNKNOWN_IN_USE in run["reasons"] else None,
             Note.ODOMETER_CONTRADICTED: run["odometer_contradicted"],
             Note.LEARNED: run["vehicle"] is VehicleFigures.LEARNED,

@@ -7,7 +7,6 @@ from pathlib import Path
 import numpy as np
 import polars as pl
 import pytest
-from schemas.monitors import BANK_MONITORS
 
 from datasets.experiment.recorded.baseline import Baseline, Onset, baseline_of, numbered, onsets_of, room_of
 from datasets.experiment.recorded.outcome import Injected, injected, outcome_row
@@ -20,6 +19,7 @@ from datasets.trial import build_run, build_site
 from pipeline import replay
 from schemas.arrays import NS_PER_S, times_ns
 from schemas.config import Configuration
+from schemas.monitors import BANK_MONITORS
 from schemas.run import RunTables
 from tests.experiment.recorded.conftest import Journey
 

@@ -54,9 +54,9 @@ def test_ubx_covariance_satellites_and_an_invalid_protection_level():
     satellites = converted.run.satellites
     assert satellites is not None
     Satellites.validate(satellites)
-    seen = next(m for m in messages(UBXReader, path, "NAV-SAT") if m.iTOW == at)
+    sent = next(m for m in messages(UBXReader, path, "NAV-SAT") if m.iTOW == at)
     row = satellites.filter(pl.col("t") == satellites["t"][0], pl.col("sv") == "G10").row(0, named=True)
-    assert (row["azimuth_deg"], row["elevation_deg"], row["residual_m"]) == (seen.azim_02, seen.elev_02, seen.prRes_02)
+    assert (row["azimuth_deg"], row["elevation_deg"], row["residual_m"]) == (sent.azim_02, sent.elev_02, sent.prRes_02)
     assert row["used"] is True
 
 

@@ -300,8 +300,8 @@ def recorded(name: str, east_m: np.ndarray, north_m: np.ndarray, rng: np.random.
 def test_recorded_passes_make_one_line_and_a_branch_meets_it_at_a_switch() -> None:
     rng = np.random.default_rng(3)
     there = np.concatenate([np.arange(0.0, 1000.0, 5.0), np.full(300, 1000.0), np.arange(1000.0, 2000.0, 5.0)])
-    way_m = np.concatenate([there, there[::-1]])
-    main = recorded("main", way_m, 0.0 * way_m, rng)
+    travelled_m = np.concatenate([there, there[::-1]])
+    main = recorded("main", travelled_m, 0.0 * travelled_m, rng)
     aside = np.arange(0.0, 1500.0, 5.0)
     # Radius 500 m from east 800 m on, until 4.5 m aside, then straight on.
     branch = recorded("branch", aside, np.clip((aside - 800.0).clip(0) ** 2 / 1000.0, 0.0, 60.0), rng)

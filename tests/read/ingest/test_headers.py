@@ -151,8 +151,8 @@ def test_times_called_gps_are_said_to_be_taken_for_utc(tmp_path: Path) -> None:
     nothing = Recordings(known=lambda _: None, write=lambda *_: None)
     for name, said in (("GPS time", 1), ("Time (UTC)", 0)):
         (tmp_path / "log.csv").write_text(f"{name},lat,lon\n{rows}")
-        seen = look_at(tmp_path / "log.csv", IngestConfig(), None, nothing)
-        assert sum('time_scale = "gps"' in text for text in seen.assumed) == said
+        log = look_at(tmp_path / "log.csv", IngestConfig(), None, nothing)
+        assert sum('time_scale = "gps"' in text for text in log.assumed) == said
 
 
 def test_units_behind_names_without_brackets(tmp_path: Path) -> None:

@@ -323,11 +323,11 @@ def test_ublox_with_satellites(tmp_path):
     assert (found["cov_ee_m2"], found["cov_nn_m2"], found["cov_uu_m2"], found["cov_en_m2"]) == (2.0, 2.0, 9.0, 0.0)
     assert (found["vel_e_mps"], found["vel_n_mps"], found["vel_u_mps"]) == (2.5, 1.5, -0.5)
     assert (found["fix"], row(path, index=1)["fix"]) == ("differential", "none")
-    seen = read_run(path, IngestConfig()).satellites
-    assert seen["sv"].to_list() == ["G08", "S23"]
-    assert seen["residual_m"].to_list() == pytest.approx([-1.2, 0.5])
-    assert seen["used"].to_list() == [True, False]
-    assert seen["azimuth_deg"].to_list() == [190.0, 170.0]
+    tracked = read_run(path, IngestConfig()).satellites
+    assert tracked["sv"].to_list() == ["G08", "S23"]
+    assert tracked["residual_m"].to_list() == pytest.approx([-1.2, 0.5])
+    assert tracked["used"].to_list() == [True, False]
+    assert tracked["azimuth_deg"].to_list() == [190.0, 170.0]
 
 
 def test_ublox_calendar(tmp_path):

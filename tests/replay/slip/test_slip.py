@@ -9,7 +9,7 @@ import pytest
 from pipeline.one_run import replay
 from schemas.config import Configuration, EvidenceConfig, MonitorConfig, Vehicle
 from schemas.run import RunTables
-from tests.replay.slip.world import BALISES, LEG_S, READ_M, STAND_S, VEHICLE, Fault, Slip, ride, site, times, way_m
+from tests.replay.slip.world import BALISES, LEG_S, READ_M, STAND_S, VEHICLE, Fault, Slip, chainage_m, ride, site, times
 
 SECOND_START_S = LEG_S + STAND_S
 SITE = site()
@@ -79,8 +79,8 @@ def test_a_fault_right_after_slip_is_found_at_once(after_s: float) -> None:
     tables = replayed(Slip(0.08), Fault(SECOND_START_S + 12.1 + after_s, 25.0))
     # Two starts leave more in doubt than a re-link may explain.
     assert accepted(tables) == ["V0", "V1", "V2", "V3"]
-    seen_s = (tables.alarms["t_start"][0] - tables.epochs["t"][0]).total_seconds()
-    assert seen_s == pytest.approx(SECOND_START_S + 12.1 + after_s, abs=0.15)
+    detected_s = (tables.alarms["t_start"][0] - tables.epochs["t"][0]).total_seconds()
+    assert detected_s == pytest.approx(SECOND_START_S + 12.1 + after_s, abs=0.15)
 
 
 def test_after_too_much_slip_only_a_telegram_links_again() -> None:
@@ -125,7 +125,7 @@ def test_a_fault_in_a_pause_of_speeds_does_not_get_through(size_m: float) -> Non
     speeds = whole.odometer.with_columns(distance_m=pl.lit(None, pl.Float64))
     paused = whole.with_streams(odometer=speeds.filter(~at_s.is_between(begin_s, begin_s + 3.0, closed="none")))
     tables = replay(paused, SITE, VEHICLE, KNOWN)
-    after = [name for name, at_m in BALISES.items() if at_m > way_m(np.array([begin_s]))[0]]
+    after = [name for name, at_m in BALISES.items() if at_m > chainage_m(np.array([begin_s]))[0]]
     assert (set(after) <= set(accepted(tables))) == (size_m == 0.0)
     assert tables.runs["unsafe_accepted"].item() == 0
     # Until the odometer is back nothing along the track can see it.
@@ -134,7 +134,7 @@ def test_a_fault_in_a_pause_of_speeds_does_not_get_through(size_m: float) -> Non
 
 def test_the_world_is_as_described() -> None:
     t_s = times()
-    true_m = way_m(t_s)
+    true_m = chainage_m(t_s)
     assert np.diff(true_m).min() >= 0.0
     assert true_m[-1] == pytest.approx(50.0 + 3 * 1600.0)
     odometer = ride(Slip(0.08)).odometer

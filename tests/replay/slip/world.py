@@ -57,7 +57,7 @@ def times() -> Floats:
     return np.arange(round((STARTS * LEG_S + STAND_S) * HZ)) / HZ
 
 
-def way_m(t_s: Floats) -> Floats:
+def chainage_m(t_s: Floats) -> Floats:
     """Stand, speed up, cruise, slow down, for each leg; 50 m behind the origin at first."""
     leg, into = np.divmod(t_s, LEG_S)
     moving = into - STAND_S
@@ -117,7 +117,7 @@ def ride(
     """
     rng = np.random.default_rng(seed)
     t_s = times()
-    true_m = way_m(t_s)
+    true_m = chainage_m(t_s)
     off_m = np.zeros(t_s.size)
     if fault is not None:
         off_m[(t_s >= fault.begin_s) & (t_s < fault.end_s)] = fault.size_m

@@ -34,7 +34,7 @@ def faults(ids: list[str], **columns: Any) -> pl.DataFrame:
     return hazards(len(ids), **(plain | columns)).with_columns(run_id=pl.Series(ids, dtype=pl.String))
 
 
-def met(ids: list[str], evidence: str | None = "reference", **columns: Any) -> pl.DataFrame:
+def passages_of(ids: list[str], evidence: str | None = "reference", **columns: Any) -> pl.DataFrame:
     """Passages of runs with this evidence."""
     plain: dict[str, Any] = {
         "solution": "primary",
@@ -104,8 +104,8 @@ class TestRuns:
     def test_shares_leave_out_what_the_odometer_alone_tells(self) -> None:
         """It can show that a position was wrong, never that it was right: its share would always be one."""
         counts = {"accepted_judged": 2, "unsafe_accepted": 2, "unproven_accepted": 8}
-        seen = faults(["a"], evidence="odometer", t_failure=[NS], t_detected=None)
-        row = campaign_runs(runs(["a"], evidence="odometer", **counts), seen, CONFIG).row(0, named=True)
+        hazards = faults(["a"], evidence="odometer", t_failure=[NS], t_detected=None)
+        row = campaign_runs(runs(["a"], evidence="odometer", **counts), hazards, CONFIG).row(0, named=True)
         assert (row["unsafe_accepted"], row["unproven_accepted"], row["unsafe_share"]) == (2, 8, None)
         assert (row["missed"], row["missed_share"], row["hazard_rate_per_h"]) == (1, None, None)
 
@@ -129,7 +129,7 @@ class TestRuns:
 class TestBalises:
     def test_shares_are_of_the_passages(self) -> None:
         found = campaign_balises(
-            met(
+            passages_of(
                 ["a", "a", "b", "c", "d", "e"],
                 status=["accepted", "accepted", "accepted", "missed", "rejected_window", "not_available"],
                 t_true=[0, None, NS, NS, NS, NS],
@@ -157,16 +157,18 @@ class TestBalises:
         assert (row["location_error_p95_m"], row["location_error_max_m"]) == (pytest.approx(27.3), 30.0)
 
     def test_without_evidence_nothing_is_known_of_unsafe_acceptances(self) -> None:
-        row = campaign_balises(met(["a", "b"], t_true=None, location_error_m=None, judgement="unknown")).row(
+        row = campaign_balises(passages_of(["a", "b"], t_true=None, location_error_m=None, judgement="unknown")).row(
             0, named=True
         )
         assert (row["passages"], row["accepted"], row["accepted_judged"], row["unproven_accepted"]) == (2, 2, 0, 2)
         assert (row["unsafe_rate"], row["unsafe_rate_high"], row["location_error_mean_m"]) == (None, None, None)
 
     def test_the_odometer_alone_calls_no_acceptance_safe(self) -> None:
-        """What it shows to be wrong is told all the same, and no share counts it."""
+        """What it shows to be wrong is counted all the same, and no share counts it."""
         errors = {"location_error_m": None, "judgement": ["unknown", "wrong"]}
-        frame = pl.concat([met(["a"], "balise", location_error_m=2.0), met(["b", "b"], "odometer", **errors)])
+        frame = pl.concat(
+            [passages_of(["a"], "balise", location_error_m=2.0), passages_of(["b", "b"], "odometer", **errors)]
+        )
         row = campaign_balises(frame).row(0, named=True)
         assert (row["accepted"], row["accepted_judged"], row["unsafe_accepted"]) == (3, 1, 1)
         assert (row["unproven_accepted"], row["location_error_count"]) == (1, 1)
@@ -177,10 +179,10 @@ class TestBalises:
     def test_solutions_and_kinds_apart_and_in_order(self) -> None:
         frame = pl.concat(
             [
-                met(["a"], solution="primary", balise_id="VB2"),
-                met(["a"], solution="gps"),
-                met(["a"], solution="primary"),
-                met(["a"], kind="physical", balise_id="BG9"),
+                passages_of(["a"], solution="primary", balise_id="VB2"),
+                passages_of(["a"], solution="gps"),
+                passages_of(["a"], solution="primary"),
+                passages_of(["a"], kind="physical", balise_id="BG9"),
             ]
         )
         found = campaign_balises(frame)
@@ -189,17 +191,17 @@ class TestBalises:
         ]  # fmt: skip
 
     def test_any_order_of_runs_gives_the_same_table(self) -> None:
-        parts = [met([run] * 3, location_error_m=[0.1 * k, 0.3, 1 / 3]) for k, run in enumerate("abcdefg")]
+        parts = [passages_of([run] * 3, location_error_m=[0.1 * k, 0.3, 1 / 3]) for k, run in enumerate("abcdefg")]
         forth, back = pl.concat(parts), pl.concat(parts[::-1])
         assert campaign_balises(forth).equals(campaign_balises(back))
 
     def test_nothing(self) -> None:
-        assert campaign_balises(met([])).height == 0
+        assert campaign_balises(passages_of([])).height == 0
 
 
 class TestAccuracy:
     def test_by_element_and_speed(self) -> None:
-        frame = met(
+        frame = passages_of(
             ["a", "a", "a", "b", "b", "b"],
             netelement_id=["ne1", "ne2", "ne1", "ne1", "ne1", "ne1"],
             location_error_m=[1.0, -13.0, 2.0, 15.0, None, 99.0],
@@ -223,7 +225,7 @@ class TestAccuracy:
 
     def test_each_against_the_accuracy_of_its_own_balise(self) -> None:
         """4 m off: beyond the 3 m of the first balise, within the 5 m of the second."""
-        frame = met(["a"] * 3, location_error_m=[4.0, -4.0, 2.0], location_accuracy_m=[3.0, 5.0, 3.0])
+        frame = passages_of(["a"] * 3, location_error_m=[4.0, -4.0, 2.0], location_accuracy_m=[3.0, 5.0, 3.0])
         row = campaign_accuracy(frame, CONFIG).row(0, named=True)
         assert (row["location_error_count"], row["within_location_accuracy"]) == (3, 2)
         assert (row["location_accuracy_m"], row["location_accuracy_max_m"]) == (3.0, 5.0)

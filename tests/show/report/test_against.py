@@ -18,7 +18,7 @@ from tests.tables import alarms, epochs, hazards, passages, table
 def tables(run_id: str, *, lost_s: float, status: str, verdict: str, **columns: object) -> RunTables:
     """Ten seconds of which `lost_s` had no TVB, all at one place, and one passage of one balise."""
     of_run = {"solution": "primary", "status": "ok", "verdict": verdict, "moving_s": 10.0, "software": "balise 1"}
-    seen = epochs(
+    epoch_rows = epochs(
         [float(k) for k in range(10)],
         solution="primary",
         step_s=1.0,
@@ -28,8 +28,8 @@ def tables(run_id: str, *, lost_s: float, status: str, verdict: str, **columns: 
         measure_m=700.0,
     )
     run = table(Runs, 1, **of_run, availability=1.0 - lost_s / 10.0, **columns)
-    met = passages(1, solution="primary", balise_id="VB1", kind="virtual", status=status)
-    return RunTables(run_id, hazards(), met, alarms(), seen, run)
+    passage_rows = passages(1, solution="primary", balise_id="VB1", kind="virtual", status=status)
+    return RunTables(run_id, hazards(), passage_rows, alarms(), epoch_rows, run)
 
 
 class Rows(HTMLParser):

@@ -210,12 +210,12 @@ def test_learning_counts_with_the_calibrated_sigma():
 def test_a_long_stand_where_rows_scatter_with_the_speed_alone():
     """Stamps on receipt: no row scatters at a stand, and the thresholds' model of the errors stays the same."""
     t_s = np.arange(0.0, 650.0, 0.1)
-    way_m = np.minimum(20.0 * t_s, 2000.0)
-    odometry = odometry_from(odometer_of(t_s, way_m), Vehicle(), CONFIG)
+    travelled_m = np.minimum(20.0 * t_s, 2000.0)
+    odometry = odometry_from(odometer_of(t_s, travelled_m), Vehicle(), CONFIG)
     noise = Noise(odometry.noise.white_m2_per_s, QuantisationNoise(0.0, 1e-3))
     known = replace(odometry.known_noise, moving_s2=np.full(t_s.size, 1e-3))
     scattered = replace(odometry, noise=noise, known_noise=known)
-    epochs = arrays_of_table(MatchedEpochs, epochs_of(t_s[20:-20], way_m[20:-20]))
+    epochs = arrays_of_table(MatchedEpochs, epochs_of(t_s[20:-20], travelled_m[20:-20]))
     aligned = align(epochs, scattered, Vehicle(), CONFIG).table
     # 0.03 s at 20 m/s, 0.6 m, counts under way alone; GNSS and odometer agree, so the scale stays 1.
     rows_m = aligned["odometer_rows_m"]

@@ -213,7 +213,7 @@ def resumed_from(learner, state, gap_s, beside_m, jitter_s=0.0):
     return learner.resume(state, t_s, path_m, 1.0, jitter_s, 20.0)
 
 
-def seen_at(learner, state, beside_m, sigma_m=1.0):
+def updated_by(learner, state, beside_m, sigma_m=1.0):
     """The joint state once the position at the state's own time is learned from."""
     at_s = np.array([state.t_s])
     return learner.run(state, at_s, learner.odometry.distance_at_s(at_s) + beside_m, np.full(1, sigma_m), np.zeros(1))[
@@ -227,7 +227,7 @@ def test_stamps_that_scatter_tell_less_of_a_move():
 
 def test_what_has_not_settled_does_so_over_the_next_break_and_after_it():
     learner, _, brought = resumed(90.0, 12.0)
-    brought = brought._replace(joint=seen_at(learner, brought, 12.0))
+    brought = brought._replace(joint=updated_by(learner, brought, 12.0))
     again = resumed_from(learner, brought, 10.0, 12.0)
     lost = learner.restart(brought, brought.t_s + 10.0, 0.0, 1.0)
     left_m2 = brought.unsettled_m2 * np.exp(-10.0 / 25.0)
@@ -259,16 +259,16 @@ def test_what_a_break_brought_is_judged_by_its_length_and_by_how_far_the_positio
 def test_what_a_position_moved_by_follows_from_bayes(beside_m, variance_m2, probability):
     moved_m = np.linspace(-200.0, 200.0, 400_001)
     prior = np.exp(-0.5 * (moved_m / 20.0) ** 2) / np.sqrt(2.0 * np.pi) / 20.0
-    seen = np.exp(-0.5 * (beside_m - moved_m) ** 2 / variance_m2)
+    likelihood = np.exp(-0.5 * (beside_m - moved_m) ** 2 / variance_m2)
     stayed = (1.0 - probability) * np.exp(-0.5 * beside_m**2 / variance_m2)
-    weight = probability * prior * seen
+    weight = probability * prior * likelihood
     expected = np.trapezoid(moved_m**2 * weight, moved_m) / (np.trapezoid(weight, moved_m) + stayed)
     assert moved_m2(beside_m, variance_m2, 20.0, probability) == pytest.approx(expected, rel=1e-6)
 
 
 def test_a_position_from_far_away_leaves_a_covariance():
     learner, _, after = resumed(90.0, 1e6)
-    covariance = seen_at(learner, after, 1e6, sigma_m=0.01)[:, :-1]
+    covariance = updated_by(learner, after, 1e6, sigma_m=0.01)[:, :-1]
     deviations = np.sqrt(np.diag(covariance))
     assert np.linalg.eigvalsh(covariance / np.outer(deviations, deviations)).min() > 0.0
 
@@ -285,7 +285,7 @@ def test_a_position_has_settled_after_some_minutes():
 
 def test_a_position_far_beside_its_place_says_nothing_of_the_scale():
     learner, before, after = resumed(90.0, 12.0)
-    updated, known = estimates_of(seen_at(learner, after, 12.0)), estimates_of(before.joint)
+    updated, known = estimates_of(updated_by(learner, after, 12.0)), estimates_of(before.joint)
     assert abs(updated.scale - known.scale) < 0.5 * known.scale_sigma
     assert updated.scale_sigma > 0.95 * known.scale_sigma
 
@@ -296,6 +296,6 @@ def test_the_speed_is_centred_but_where_the_odometer_ends(at_s, speed_mps):
     odometry = odometry_from(odometer_of([0.0, 2.0, 4.0, 6.0, 8.0], distance_m=[0.0, 20.0, 40.0, 80.0, 160.0]))
     odometry = replace(odometry, t_s=np.arange(0.0, 9.0, 2.0), distance_m=np.array([0.0, 20.0, 40.0, 80.0, 160.0]))
     learner = ScaleLatencyFilter(*error_model(CONFIG.monitors), odometry, CONFIG.align)
-    way_m, found_mps = learner._odometer_at(at_s, 0.0)
-    assert way_m == np.interp(at_s, odometry.t_s, odometry.distance_m)
+    travelled_m, found_mps = learner._odometer_at(at_s, 0.0)
+    assert travelled_m == np.interp(at_s, odometry.t_s, odometry.distance_m)
     assert found_mps == pytest.approx(speed_mps)

@@ -74,10 +74,10 @@ def no_gaps(begin: TrueAnchor, end: TrueAnchor) -> list[float]:
 def test_seventy_seconds_of_changing_speed_tell_a_lag() -> None:
     """Seven ways of ten seconds, and six are enough; the odometer stamps 0.4 s earlier."""
     fine_s = np.arange(0.0, 73.0, 0.01)
-    way_m = np.cumsum(np.interp(fine_s, [0, 12, 24, 36, 48, 60, 72], [4, 28, 6, 30, 8, 26, 4])) * 0.01
+    travelled_m = np.cumsum(np.interp(fine_s, [0, 12, 24, 36, 48, 60, 72], [4, 28, 6, 30, 8, 26, 4])) * 0.01
     t_s = np.arange(0.0, 71.0, 0.1)
-    late = stretch(t_s + 0.4, np.interp(t_s, fine_s, way_m))
-    counted = counter(np.interp(np.arange(0.0, 72.0, 0.1), fine_s, way_m), 10.0)
+    late = stretch(t_s + 0.4, np.interp(t_s, fine_s, travelled_m))
+    counted = counter(np.interp(np.arange(0.0, 72.0, 0.1), fine_s, travelled_m), 10.0)
     (found,) = measure_lags(*reference_movements([OrientedStretch(late, 1, 1.0, 0.0)], no_gaps), counted, CONFIG).found
     assert found.lag_s == pytest.approx(0.4, abs=0.03)
     assert found.lag_sigma_s < 0.05
@@ -126,14 +126,14 @@ def test_a_step_leaves_both_sides_open_where_no_read_confirms(
 
 
 @pytest.mark.parametrize("begun_s", [20.0, 80.0, 130.0])
-def test_a_drift_is_seen_wherever_long_windows_begin(begun_s: float) -> None:
+def test_a_drift_shows_wherever_long_windows_begin(begun_s: float) -> None:
     """11 m off within 40 s at sigma 0.4 m: 5.33 roots of two samples are 3 m, not reached in 10 s, and with 5 m 8 m."""
     t_s = np.arange(0.0, 260.0, 0.5)
     drift_m = 11.0 * np.clip((t_s - begun_s) / 40.0, 0.0, 1.0)
     sigma_m = np.full(t_s.size, 0.4)
-    seen = replace(stretch(t_s, 20.0 * t_s + drift_m), sigma_m=sigma_m)
+    drifting = replace(stretch(t_s, 20.0 * t_s + drift_m), sigma_m=sigma_m)
     witness = Witness(counter(20.0 * np.arange(0.0, 261.0, 0.5), 2.0))
-    found = stretch_as_evidence(OrientedStretch(seen, 1, 1.0, 0.0), SURE, (witness,), [], 0.0, CONFIG)
+    found = stretch_as_evidence(OrientedStretch(drifting, 1, 1.0, 0.0), SURE, (witness,), [], 0.0, CONFIG)
     assert found.levels.count_doubted_steps == 1
     honest = replace(stretch(t_s, 20.0 * t_s), sigma_m=sigma_m)
     assert (

@@ -29,9 +29,9 @@ def straight(seed: int, length_s: float = 900.0, rate_hz: float = 5.0) -> tuple[
     """Times, true way at 20 m/s and more by turns, and what positions are off north and east: a walk of 0.1 m/s."""
     rng = np.random.default_rng(seed)
     t_s = np.arange(0.0, length_s, 1.0 / rate_hz)
-    way_m = 20.0 * t_s + 40.0 * np.sin(t_s / 15.0)
+    travelled_m = 20.0 * t_s + 40.0 * np.sin(t_s / 15.0)
     off_m = 0.1 * np.cumsum(rng.standard_normal((2, t_s.size)), axis=1)
-    return t_s, way_m, off_m[0], off_m[1]
+    return t_s, travelled_m, off_m[0], off_m[1]
 
 
 @pytest.mark.parametrize("receiver", RECEIVERS)
@@ -52,37 +52,37 @@ def test_differences_and_chainage_of_positions_are_found(kind: str) -> None:
 @pytest.mark.parametrize("sign", [1.0, -1.0])
 @pytest.mark.parametrize("late", [0, 3])
 def test_a_counter_of_the_positions_either_way_and_late(sign: float, late: int) -> None:
-    t_s, way_m, north_m, east_m = straight(1)
-    copied_m = np.roll(way_m + north_m, late)[late:]
+    t_s, travelled_m, north_m, east_m = straight(1)
+    copied_m = np.roll(travelled_m + north_m, late)[late:]
     counter = odometer_frame(t_s[late:], sign * copied_m, None)
-    found = follows_positions(counter, fixes(t_s, way_m + north_m, east_m), CONFIG)
+    found = follows_positions(counter, fixes(t_s, travelled_m + north_m, east_m), CONFIG)
     assert found.ratio is not None
     assert found.ratio < 0.05
 
 
 def test_the_same_way_counted_by_a_wheel() -> None:
-    t_s, way_m, north_m, east_m = straight(2)
-    counter = odometer_frame(t_s, np.floor(way_m / 0.1) * 0.1, None)
-    found = follows_positions(counter, fixes(t_s, way_m + north_m, east_m), CONFIG)
+    t_s, travelled_m, north_m, east_m = straight(2)
+    counter = odometer_frame(t_s, np.floor(travelled_m / 0.1) * 0.1, None)
+    found = follows_positions(counter, fixes(t_s, travelled_m + north_m, east_m), CONFIG)
     assert found.ratio is not None
     assert found.ratio > 0.8
 
 
 def test_a_copy_of_what_is_better_than_the_odometers_own_noise_shows_nothing() -> None:
     """Positions to 2 mm, and what was made of them written in metres: the declaration alone stands."""
-    t_s, way_m, north_m, east_m = straight(3)
-    counter = odometer_frame(t_s, np.round(way_m + 0.02 * north_m), None)
-    found = follows_positions(counter, fixes(t_s, way_m + 0.02 * north_m, 0.02 * east_m), CONFIG)
+    t_s, travelled_m, north_m, east_m = straight(3)
+    counter = odometer_frame(t_s, np.round(travelled_m + 0.02 * north_m), None)
+    found = follows_positions(counter, fixes(t_s, travelled_m + 0.02 * north_m, 0.02 * east_m), CONFIG)
     assert found.ratio is not None
     assert found.ratio > 1.0
 
 
 def test_too_few_steps_and_no_common_time() -> None:
-    t_s, way_m, north_m, east_m = straight(4, length_s=70.0)
-    counter = odometer_frame(t_s, way_m + north_m, None)
-    placed = fixes(t_s, way_m + north_m, east_m)
+    t_s, travelled_m, north_m, east_m = straight(4, length_s=70.0)
+    counter = odometer_frame(t_s, travelled_m + north_m, None)
+    placed = fixes(t_s, travelled_m + north_m, east_m)
     assert follows_positions(counter, placed, CONFIG).ratio is None
-    later = odometer_frame(t_s + 1000.0, way_m, None)
+    later = odometer_frame(t_s + 1000.0, travelled_m, None)
     assert follows_positions(later, placed, CONFIG) == NOT_TESTED
     assert follows_positions(counter.head(0), placed, CONFIG) == NOT_TESTED
     few = Configuration(evidence=EvidenceConfig(follows_steps_least=200))
@@ -90,11 +90,11 @@ def test_too_few_steps_and_no_common_time() -> None:
 
 
 def test_a_reset_and_gaps_hide_no_copy() -> None:
-    t_s, way_m, north_m, east_m = straight(5)
-    counted_m = np.where(t_s < 300.0, way_m + north_m, way_m + north_m - 5000.0)
+    t_s, travelled_m, north_m, east_m = straight(5)
+    counted_m = np.where(t_s < 300.0, travelled_m + north_m, travelled_m + north_m - 5000.0)
     kept = ~((t_s > 500.0) & (t_s < 540.0))
     counter = odometer_frame(t_s[kept], counted_m[kept], None)
-    found = follows_positions(counter, fixes(t_s, way_m + north_m, east_m), CONFIG)
+    found = follows_positions(counter, fixes(t_s, travelled_m + north_m, east_m), CONFIG)
     assert found.ratio is not None
     assert found.ratio < 0.1
 

@@ -112,7 +112,7 @@ def _verdict(rung: Rung) -> list[str]:
     failing = (np.abs(epochs.error_m) > LIMIT_M + CLEAR_M) & surely
     failing_s = longest_s(rung, failing)
     moving = rung.tables.epochs["moving"].fill_null(True).to_numpy()
-    unseen_s = longest_s(rung, (epochs.judgement == "unknown") & surely & moving)
+    unknown_s = longest_s(rung, (epochs.judgement == "unknown") & surely & moving)
     period = float(np.median(np.diff(epochs.time_s)))
     maybe = (np.abs(epochs.error_m) > LIMIT_M - CLEAR_M) | epochs.beside
     maybe_accepted = accepted & ((np.abs(offers.error_m) > LIMIT_M - CLEAR_M) | offers.beside)
@@ -127,7 +127,7 @@ def _verdict(rung: Rung) -> list[str]:
         "an acceptance is wrong or unknown, or there is none": verdict == "safe" and unproven,
         "a VB was accepted wrong": verdict != "unsafe" and row["unsafe_accepted"] != 0,
         "a failure is longer than the budget": verdict != "unsafe" and over,
-        f"{unseen_s:.2f} s on end are unknown in use": verdict == "safe" and unseen_s > BUDGET_S + period,
+        f"{unknown_s:.2f} s on end are unknown in use": verdict == "safe" and unknown_s > BUDGET_S + period,
         "there is no diagnosis": verdict == "safe" and rung.journey.world.counter is None,
         "the odometer alone proves nothing": verdict == "safe" and rung.name == "odometer",
         "there is no verdict": verdict is None,

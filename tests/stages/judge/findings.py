@@ -94,8 +94,8 @@ class Rung:
     def _judged(self, what: str, frame: pl.DataFrame, times: pl.Series, sure: Bools) -> Judgements:
         journey, time = self.journey, seconds(times)
         names = frame["netelement_id"].to_list()
-        place = journey.way_of(names, frame["measure_m"].fill_null(np.nan).to_numpy())
-        true = journey.true_way_m(time)
+        place = journey.chainage_of(names, frame["measure_m"].fill_null(np.nan).to_numpy())
+        true = journey.true_chainage_m(time)
         return Judgements(
             what,
             time,
@@ -301,7 +301,7 @@ def _at_switch(rung: Rung, kind: Judgements) -> Bools:
     ends = [element.base_m[[0, -1]] for element in rung.journey.world.ground.elements if element.name == "neighbour"]
     starts = rung.journey.world.ground.route.starts_m
     joints = starts[np.isin(starts, [starts[np.argmin(np.abs(starts - end))] for pair in ends for end in pair])]
-    way = rung.journey.true_way_m(kind.time_s)
+    way = rung.journey.true_chainage_m(kind.time_s)
     near = np.any([np.abs(way - joint) < AT_JOINT_M for joint in joints] or [np.zeros(len(way), bool)], axis=0)
     return np.asarray(near | (kind.apart_m <= APART_M))
 

@@ -100,20 +100,20 @@ class Route:
     def length_m(self) -> float:
         return float(self.starts_m[-1])
 
-    def locate(self, way_m: Floats) -> tuple[NDArray[np.int64], Floats]:
+    def locate(self, chainage_m: Floats) -> tuple[NDArray[np.int64], Floats]:
         """Index of the element, and measure on it."""
-        index = np.clip(np.searchsorted(self.starts_m, way_m, side="right") - 1, 0, len(self.elements) - 1)
-        return index, way_m - self.starts_m[index]
+        index = np.clip(np.searchsorted(self.starts_m, chainage_m, side="right") - 1, 0, len(self.elements) - 1)
+        return index, chainage_m - self.starts_m[index]
 
-    def way_m(self, netelement_id: str, measure_m: float) -> float | None:
+    def chainage_m(self, netelement_id: str, measure_m: float) -> float | None:
         """The way of a place on the route, none for a place beside it."""
         names = [element.name for element in self.elements]
         return float(self.starts_m[names.index(netelement_id)] + measure_m) if netelement_id in names else None
 
-    def points(self, way_m: Floats, left_m: Floats, up_m: Floats) -> tuple[Floats, Floats]:
+    def points(self, chainage_m: Floats, left_m: Floats, up_m: Floats) -> tuple[Floats, Floats]:
         """Points [m, ENU of the origin] beside the route, and unit tangents (east, north)."""
-        index, measure = self.locate(way_m)
-        plane, tangent = np.zeros((len(way_m), 2)), np.zeros((len(way_m), 2))
+        index, measure = self.locate(chainage_m)
+        plane, tangent = np.zeros((len(chainage_m), 2)), np.zeros((len(chainage_m), 2))
         for number, element in enumerate(self.elements):
             here = index == number
             plane[here], tangent[here] = element.at(measure[here])
@@ -132,16 +132,16 @@ class Ground:
     route: Route
     aside_m: float = 0.0
 
-    def other_left_m(self, way_m: Floats) -> Floats:
+    def other_left_m(self, chainage_m: Floats) -> Floats:
         """How far to the left of the route another track lies there; NaN where there is none."""
-        left = np.full(len(way_m), np.nan)
+        left = np.full(len(chainage_m), np.nan)
         taken = {element.base_m[0]: number for number, element in enumerate(self.route.elements)}
         names = {element.name for element in self.route.elements}
         for other in (element for element in self.elements if element.name not in names):
             number = taken[other.base_m[0]]
             begin, end = self.route.starts_m[number : number + 2]
-            here = (way_m >= begin) & (way_m <= end)
-            left[here] = self.aside_m * _switch(way_m[here] - begin, end - begin)
+            here = (chainage_m >= begin) & (chainage_m <= end)
+            left[here] = self.aside_m * _switch(chainage_m[here] - begin, end - begin)
         return left
 
     def element(self, name: str) -> Element:

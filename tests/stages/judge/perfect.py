@@ -53,9 +53,9 @@ def _row(rung: Rung) -> pl.DataFrame:
     unproven = int((accepted & (rung.passages.judgement == "unknown")).sum())
     hazardous, share = longest_s(rung, wrong), _share(rung)
     moving = rung.tables.epochs["moving"].fill_null(True).to_numpy()
-    unseen = longest_s(rung, surely & moving & (rung.epochs.judgement == "unknown"))
+    unknown_s = longest_s(rung, surely & moving & (rung.epochs.judgement == "unknown"))
     bad = unsafe > 0 or hazardous > BUDGET_S
-    doubtful = unproven > 0 or unseen > BUDGET_S or not accepted.any()
+    doubtful = unproven > 0 or unknown_s > BUDGET_S or not accepted.any()
     return rung.tables.runs.with_columns(
         verdict=pl.lit("unsafe" if bad else "unproven" if doubtful else "safe"),
         unsafe_accepted=pl.lit(unsafe),

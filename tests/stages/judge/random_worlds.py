@@ -161,7 +161,7 @@ def _with_slip(draw: Draw, world: World, ride: Ride, faults: tuple[Fault, ...]) 
     begin = draw.between(40.0, ride.length_s - 60.0)
     end = begin + draw.between(5.0, 20.0)
     time = np.arange(begin, end, 0.1)
-    moved = abs(float(ride.way_m(np.array(end)) - ride.way_m(np.array(begin))))
+    moved = abs(float(ride.chainage_m(np.array(end)) - ride.chainage_m(np.array(begin))))
     steady = moved > 60.0 and bool((np.abs(ride.speed_mps(time)) > 3.0).all())
     kind = draw.one("slip", "slip", "freeze", "outage")
     if not steady:

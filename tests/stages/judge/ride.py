@@ -32,7 +32,7 @@ class Ride:
     def length_s(self) -> float:
         return float(self.time_s[-1])
 
-    def way_m(self, time_s: Floats) -> Floats:
+    def chainage_m(self, time_s: Floats) -> Floats:
         """Way over the route; before the start and after the end the train stands."""
         return np.interp(time_s, self.time_s, self.track_m)
 
@@ -50,11 +50,11 @@ class Ride:
         last = np.where(last == 0, np.argmax(moved), last)
         return np.sign(self.velocity_mps[last])
 
-    def passings_s(self, way_m: float) -> list[float]:
+    def passings_s(self, chainage_m: float) -> list[float]:
         """When the train passes a place."""
-        side = np.sign(self.track_m - way_m)
+        side = np.sign(self.track_m - chainage_m)
         at = np.flatnonzero(side[1:] * side[:-1] < 0)
-        share = (way_m - self.track_m[at]) / (self.track_m[at + 1] - self.track_m[at])
+        share = (chainage_m - self.track_m[at]) / (self.track_m[at + 1] - self.track_m[at])
         return [float(time) for time in self.time_s[at] + share * TICK_S]
 
 

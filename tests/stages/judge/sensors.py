@@ -108,9 +108,9 @@ def gnss(rng: np.random.Generator, ride: Ride, ground: Ground, of: Receiver) -> 
     time = _ticks(ride.length_s, of.rate_hz)
     late = of.latency_s + sum((fault.late_s(time) for fault in of.faults), np.zeros_like(time))
     fault = sum((fault.along_m(time) for fault in of.faults), np.zeros_like(time))
-    other = np.nan_to_num(ground.other_left_m(ride.way_m(time - late) + fault))
+    other = np.nan_to_num(ground.other_left_m(ride.chainage_m(time - late) + fault))
     left = sum((fault.left_m(time, other) for fault in of.faults), np.zeros_like(time))
-    along = ride.way_m(time - late) + fault + _noise(rng, time, of)
+    along = ride.chainage_m(time - late) + fault + _noise(rng, time, of)
     enu, tangent = ground.route.points(
         along + of.antenna_ahead_m, left + _noise(rng, time, of), 1.5 * _noise(rng, time, of)
     )
@@ -197,7 +197,7 @@ def reference(rng: np.random.Generator, ride: Ride, route: Route, of: Better, an
     if of.aside is not None:
         begin, end, metres = of.aside
         errors[0] += np.where((time >= begin) & (time < end), metres, 0.0)
-    enu, _ = route.points(ride.way_m(time) + errors[0] + antenna_ahead_m, errors[1], errors[2])
+    enu, _ = route.points(ride.chainage_m(time) + errors[0] + antenna_ahead_m, errors[1], errors[2])
     latitude, longitude, height = geodetic(enu)
     frame = pl.DataFrame(
         {
@@ -217,7 +217,7 @@ def reads(rng: np.random.Generator, ride: Ride, route: Route, balises: list[Bali
     """One telegram per passing of a physical balise of the route; the place is off by `sigma_m`, hence the time."""
     found: list[tuple[float, str]] = []
     for balise in balises:
-        way = route.way_m(balise.netelement_id, balise.measure_m)
+        way = route.chainage_m(balise.netelement_id, balise.measure_m)
         if balise.kind != "physical" or way is None:
             continue
         found += [

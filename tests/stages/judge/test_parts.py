@@ -273,8 +273,8 @@ def test_what_an_episode_hit() -> None:
         epoch, judgement=code, error_low_m=least_m, error_high_m=least_m + 2.0,
         offered=[k != 2 for k in range(10)], track_assumed=False, wrong_track=[number == 7 for number in epoch],
     )  # fmt: skip
-    met = history(positions(range(10)), offered=offered)
-    found = hazard_rows([replace(EPISODE, onset=2, end=8)], met)
+    judged = history(positions(range(10)), offered=offered)
+    found = hazard_rows([replace(EPISODE, onset=2, end=8)], judged)
     assert [(row.hazard, row.hits) for row in found] == [(Hazard.VB_SHIFT, [1, 9]), (Hazard.VB_WRONG_TRACK, [6])]
 
 
@@ -304,18 +304,18 @@ def test_a_jump_back_leads_to_a_place_that_is_not_wrong(
 @pytest.mark.parametrize(("may_s", "detected_s"), [(104.5, 107.0), (None, 107.0), (104.5, None)])
 def test_the_times_of_a_hazard(may_s: float | None, detected_s: float | None) -> None:
     """Onset at 103 s, a VB hit at 104 s, failure at 105 s or a little before, alarm at 107 s, end at 109 s."""
-    met = history(positions([100.0 + k for k in range(10)]), offered=offers([1, 4], t=[101 * NS, 104 * NS]))
+    judged = history(positions([100.0 + k for k in range(10)]), offered=offers([1, 4], t=[101 * NS, 104 * NS]))
     episode = replace(
         EPISODE, onset_ns=103 * NS, end_ns=109 * NS, failed=5, may_ns=ns(may_s), detection=Detection(ns(detected_s))
     )
-    found = instant_columns(HazardRow(Hazard.VB_SHIFT, episode, None, [1]), met)
+    found = instant_columns(HazardRow(Hazard.VB_SHIFT, episode, None, [1]), judged)
     times = [found[name] for name in ("t_onset", "t_hazard", "t_failure", "t_end")]
     assert times == seconds(103, 104, 105, 109).tolist()
-    seen = detected_s is not None
-    assert (found["detected"], found["t_negated"]) == (seen, 108 * NS if seen else None)  # one epoch to react
-    assert found["time_to_detect_s"] == (4.0 if seen else None)
-    assert found["time_since_failure_s"] == (2.0 if seen else None)
-    assert found["time_since_failure_may_s"] == (2.5 if seen and may_s is not None else None)
+    detected = detected_s is not None
+    assert (found["detected"], found["t_negated"]) == (detected, 108 * NS if detected else None)  # one epoch to react
+    assert found["time_to_detect_s"] == (4.0 if detected else None)
+    assert found["time_since_failure_s"] == (2.0 if detected else None)
+    assert found["time_since_failure_may_s"] == (2.5 if detected and may_s is not None else None)
 
 
 @pytest.mark.parametrize(
@@ -697,8 +697,8 @@ def test_a_hazard_rests_on_what_judged_its_first_balise_else_on_its_first_positi
     first: str | None, kind: Evidence
 ) -> None:
     offered = offers([2, 3], evidence=[first, "odometer"])
-    met = history(positions(range(5), evidence=["balise", *["odometer"] * 4]), offered=offered)
-    assert _evidence_of_row(HazardRow(Hazard.VB_SHIFT, EPISODE, None, [0, 1]), met) is kind
+    judged = history(positions(range(5), evidence=["balise", *["odometer"] * 4]), offered=offered)
+    assert _evidence_of_row(HazardRow(Hazard.VB_SHIFT, EPISODE, None, [0, 1]), judged) is kind
 
 
 def test_pulses_are_one_failure_and_a_calm_half_minute_ends_it() -> None:

@@ -24,12 +24,12 @@ EXACT = Receiver(sigma_m=0.0, white_m=0.001)
 
 @pytest.mark.parametrize("ground", GROUNDS.values(), ids=GROUNDS.keys())
 def test_positions_lie_where_the_truth_says(ground: Ground) -> None:
-    """A matched position is the told way to centimetres, so the true error is what was put in."""
+    """A matched position is the reported chainage to centimetres, so the true error is what was put in."""
     journey = make_journey(World(ground, LEGS, receiver=EXACT), seed=1)
     epochs = replay(journey.run, journey.site, journey.vehicle).epochs
     assert journey.on_route(epochs["netelement_id"].to_list()).all()
-    way = journey.way_of(epochs["netelement_id"].to_list(), epochs["measure_m"].to_numpy())
-    assert np.abs(way - journey.told_way_m).max() < 0.03
+    way = journey.chainage_of(epochs["netelement_id"].to_list(), epochs["measure_m"].to_numpy())
+    assert np.abs(way - journey.reported_chainage_m).max() < 0.03
     assert np.abs(journey.error_m()).max() < 0.01
 
 
@@ -85,7 +85,7 @@ def test_the_odometer_counts_what_it_should() -> None:
     odometer = journey.run.odometer
     assert odometer is not None
     time, counted = seconds(odometer["t"]), -odometer["distance_m"].to_numpy()
-    true = (journey.ride.way_m(time) - journey.world.start_m) / 1.01
+    true = (journey.ride.chainage_m(time) - journey.world.start_m) / 1.01
 
     def lost_m(at_s: float) -> float:
         return float((counted - true)[np.argmin(np.abs(time - at_s))])
@@ -103,9 +103,9 @@ def test_reads_and_reference_stay_within_their_sigma() -> None:
     assert reads is not None
     places = {balise.balise_id: (balise.netelement_id, balise.measure_m) for balise in journey.balises}
     for time, name in zip(seconds(reads["t"]), reads["balise_id"], strict=True):
-        way = journey.world.ground.route.way_m(*places[name])
+        way = journey.world.ground.route.chainage_m(*places[name])
         assert way is not None
-        assert abs(way - float(journey.ride.way_m(np.array(time)))) < 2.5 * 0.4 + 0.01
+        assert abs(way - float(journey.ride.chainage_m(np.array(time)))) < 2.5 * 0.4 + 0.01
     assert reads.height >= 3
 
 

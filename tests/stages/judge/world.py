@@ -52,19 +52,19 @@ class Journey:
     site: Site
     vehicle: Vehicle
     epoch_s: Floats
-    told_way_m: Floats
+    reported_chainage_m: Floats
 
     def judged_at_s(self, time_s: Floats) -> Floats:
         """The instant at which a position is judged: its stamp less the latency of the vehicle file."""
         return time_s - (self.vehicle.gnss_latency_s or 0.0)
 
-    def true_way_m(self, time_s: Floats) -> Floats:
+    def true_chainage_m(self, time_s: Floats) -> Floats:
         """Way of the balise antenna at the instant at which positions of these stamps are judged."""
-        return self.ride.way_m(self.judged_at_s(time_s))
+        return self.ride.chainage_m(self.judged_at_s(time_s))
 
     def error_m(self) -> Floats:
         """True along-track error of each epoch, in the direction of travel."""
-        apart: Floats = self.told_way_m - self.true_way_m(self.epoch_s)
+        apart: Floats = self.reported_chainage_m - self.true_chainage_m(self.epoch_s)
         return apart * self.sense(self.epoch_s)
 
     def sense(self, time_s: Floats) -> Floats:
@@ -72,10 +72,10 @@ class Journey:
 
     def true_place(self, time_s: Floats) -> tuple[list[str], Floats]:
         """Net element and measure of the train at the instant of judging."""
-        index, measure = self.world.ground.route.locate(self.true_way_m(time_s))
+        index, measure = self.world.ground.route.locate(self.true_chainage_m(time_s))
         return [self.world.ground.route.elements[k].name for k in index], measure
 
-    def way_of(self, netelement_id: list[str | None], measure_m: Floats) -> Floats:
+    def chainage_of(self, netelement_id: list[str | None], measure_m: Floats) -> Floats:
         """Way abreast of places on any element; NaN where there is no place."""
         ways = np.full(len(measure_m), np.nan)
         for element in self.world.ground.elements:
@@ -99,9 +99,9 @@ class Journey:
         names = {element.name for element in self.world.ground.route.elements}
         return np.array([name in names for name in netelement_id], bool)
 
-    def apart_m(self, way_m: Floats) -> Floats:
+    def apart_m(self, chainage_m: Floats) -> Floats:
         """How far another track lies beside the route there; infinite where there is none."""
-        return np.nan_to_num(np.abs(self.world.ground.other_left_m(way_m)), nan=np.inf)
+        return np.nan_to_num(np.abs(self.world.ground.other_left_m(chainage_m)), nan=np.inf)
 
     @property
     def slips(self) -> tuple[Slip, ...]:

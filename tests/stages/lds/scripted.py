@@ -184,17 +184,20 @@ def run(
     )
 
 
-def _crossings(met: Crossings) -> pl.DataFrame:
+def _crossings(crossings: Crossings) -> pl.DataFrame:
     """One row each; `crossing_id` is its place."""
     words = [status.value for status in PassageStatus] + [None]
     return pl.DataFrame(
         {
-            "crossing_id": np.arange(met.size),
-            "t": pl.Series(met.t_ns, dtype=pl.Int64).cast(INSTANT),
-            "kind": np.where(met.virtual, "virtual", "physical"),
-            "status": pl.Series([words[number] for number in met.status], dtype=pl.String),
-            **{name: getattr(met, name) for name in ("balise_id", "netelement_id", "measure_m", "leg", "path_m")},
-            **{name: getattr(met, name) for name in ("before", "epoch", "sense", "direction", "odometer_m", "offered")},
+            "crossing_id": np.arange(crossings.size),
+            "t": pl.Series(crossings.t_ns, dtype=pl.Int64).cast(INSTANT),
+            "kind": np.where(crossings.virtual, "virtual", "physical"),
+            "status": pl.Series([words[number] for number in crossings.status], dtype=pl.String),
+            **{name: getattr(crossings, name) for name in ("balise_id", "netelement_id", "measure_m", "leg", "path_m")},
+            **{
+                name: getattr(crossings, name)
+                for name in ("before", "epoch", "sense", "direction", "odometer_m", "offered")
+            },
         }
     )
 

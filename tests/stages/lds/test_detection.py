@@ -257,8 +257,8 @@ def test_jump_over_two_balises_offers_both_in_order() -> None:
     path_m = [value + (120.0 if k >= 15 else 0.0) for k, value in enumerate(odometer_m)]
     balises = balises_at({"V1": 110.0, "V2": 350.0, "V3": 400.0})
     # The linking distance fails at the same epoch, and a failing monitor comes first.
-    seen = run(epochs_of(path_m, odometer_m), balises)
-    assert [row[1] for row in passage_rows(seen, *STATUS)] == ["accepted", "rejected_monitor", "rejected_monitor"]
+    outcome = run(epochs_of(path_m, odometer_m), balises)
+    assert [row[1] for row in passage_rows(outcome, *STATUS)] == ["accepted", "rejected_monitor", "rejected_monitor"]
     result = run(epochs_of(path_m, odometer_m), balises, disabled=["link_distance"])
     assert passage_rows(result, *STATUS, "odometer_distance_m", "linking_error") == [
         ("V1", "accepted", 5.5, None, "none"),
@@ -284,7 +284,7 @@ def test_a_coarse_count_over_two_balises_near_each_other_is_no_disorder(
     assert result["alarm"].any() == (disordered == 2.0)
 
 
-def test_the_same_jump_seen_by_the_bank_is_rejected_by_it() -> None:
+def test_the_same_jump_that_fails_the_bank_is_rejected_by_it() -> None:
     odometer_m = steps(0.0, 20.0, 30)
     path_m = [value + (120.0 if k >= 15 else 0.0) for k, value in enumerate(odometer_m)]
     result = run(
@@ -295,7 +295,7 @@ def test_the_same_jump_seen_by_the_bank_is_rejected_by_it() -> None:
     assert [row[1] for row in passage_rows(result, *STATUS)] == ["accepted", "rejected_monitor", "rejected_monitor"]
 
 
-def test_the_same_jump_without_an_odometer_goes_unseen() -> None:
+def test_the_same_jump_without_an_odometer_is_not_detected() -> None:
     path_m = [value + (120.0 if k >= 15 else 0.0) for k, value in enumerate(steps(0.0, 20.0, 30))]
     bank = ScriptedBank(blind=range(30))
     result = run(epochs_of(path_m, [None] * 30), balises_at({"V1": 110.0, "V2": 350.0, "V3": 400.0}), bank)

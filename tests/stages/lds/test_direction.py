@@ -59,9 +59,9 @@ def test_a_balise_of_the_other_direction_is_not_missed_in_an_outage() -> None:
 @pytest.mark.parametrize("with_odometer", [True, False])
 def test_a_jump_back_re_crosses_a_balise_in_the_direction_of_the_train(with_odometer: bool) -> None:
     """The position jumps 120 m back at 10 s, over V1 at 110 m, which is valid ahead only: the train goes on ahead."""
-    way_m = steps(0.0, 20.0, 30)
-    path_m = [x - (120.0 if k >= 10 else 0.0) for k, x in enumerate(way_m)]
-    epochs = epochs_of(path_m, way_m if with_odometer else [None] * 30)
+    chainage_m = steps(0.0, 20.0, 30)
+    path_m = [x - (120.0 if k >= 10 else 0.0) for k, x in enumerate(chainage_m)]
+    epochs = epochs_of(path_m, chainage_m if with_odometer else [None] * 30)
     ahead, both, back = (run(epochs, balises_at({"V1": 110.0}, valid_direction=valid)) for valid in (AHEAD, BOTH, BACK))
     assert passage_rows(ahead, *COLUMNS) == passage_rows(both, *COLUMNS)
     assert ahead.crossings["sense"].to_list() == [1, -1, 1]
@@ -73,8 +73,8 @@ def test_a_jump_back_re_crosses_a_balise_in_the_direction_of_the_train(with_odom
 def test_who_turns_just_behind_a_balise_of_the_other_direction_misses_nothing(beyond_m: float) -> None:
     """A turn is known 5 m after it: whether the balise counts then or not, it is not missed and brakes nobody."""
     ahead = [*steps(0.0, 10.0, 51), 500.0 + beyond_m]
-    way_m = [*ahead, *[500.0 + beyond_m] * 5, *steps(499.0, -10.0, 49)]
-    result = run(epochs_of(way_m), balises_at({"V1": 100.0, "V2": 500.5}, valid_direction=[BOTH, BACK]))
+    chainage_m = [*ahead, *[500.0 + beyond_m] * 5, *steps(499.0, -10.0, 49)]
+    result = run(epochs_of(chainage_m), balises_at({"V1": 100.0, "V2": 500.5}, valid_direction=[BOTH, BACK]))
     rows = passage_rows(result, *COLUMNS)
     assert all(status == "accepted" for _, _, status, _, _ in rows)
     assert ("V2", "growing") not in [row[:2] for row in rows]
@@ -99,16 +99,16 @@ def test_no_row_is_of_a_direction_in_which_its_balise_is_not_valid(seed: int) ->
 def test_a_balise_of_the_other_direction_changes_nothing_for_the_rest(seed: int) -> None:
     """Of a train that never turns, with and without them."""
     chaos = Chaos(seed)
-    way_m = steps(-400.0, 20.0, len(chaos.path_m))
+    chainage_m = steps(-400.0, 20.0, len(chaos.path_m))
     path_m = [
         None if x is None else way + (x - o if o is not None else 0.0)
-        for x, way, o in zip(chaos.path_m, way_m, chaos.odometer_m, strict=True)
+        for x, way, o in zip(chaos.path_m, chainage_m, chaos.odometer_m, strict=True)
     ]
     virtual = {name: at_m for name, at_m in chaos.places.items() if name[0] == "V"}
     some = dict(list(virtual.items())[::2])
     bank = {"fails": chaos.fails, "blind": chaos.blind}
-    less = run(epochs_of(path_m, way_m), balises_at(some), ScriptedBank(**bank))
+    less = run(epochs_of(path_m, chainage_m), balises_at(some), ScriptedBank(**bank))
     valid = [BOTH if name in some else BACK for name in virtual]
-    more = run(epochs_of(path_m, way_m), balises_at(virtual, valid_direction=valid), ScriptedBank(**bank))
+    more = run(epochs_of(path_m, chainage_m), balises_at(virtual, valid_direction=valid), ScriptedBank(**bank))
     assert more.passages.equals(less.passages)
     assert more.epochs.equals(less.epochs)

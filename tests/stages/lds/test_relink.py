@@ -255,8 +255,8 @@ def outage(gap_s: float, offset_m: float, **settings: Any) -> LdsTables:
 def test_a_position_after_an_outage_has_to_re_link(gap_s: float) -> None:
     # The last TVB is at 20 s.
     waited_s = gap_s
-    way_m = 20.0 * waited_s
-    bound_m = min(10.0, K_T * sqrt(2.0 + 0.05**2 * waited_s + (1e-4 * way_m) ** 2))
+    travelled_m = 20.0 * waited_s
+    bound_m = min(10.0, K_T * sqrt(2.0 + 0.05**2 * waited_s + (1e-4 * travelled_m) ** 2))
     for offset_m, state in ((0.0, "pass"), (bound_m - 0.01, "pass"), (-bound_m - 0.01, "fail"), (30.0, "fail")):
         result = outage(gap_s, offset_m)
         row = result.epochs.row(BEFORE, named=True)

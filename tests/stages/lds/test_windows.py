@@ -48,8 +48,8 @@ def test_window_holds_every_reading_within_the_odometer_s_accuracy(
     distance_m: float, accuracy_m: float, reference_m: float, reading: float
 ) -> None:
     # The true way lies within the two location accuracies; the reading d is true to 5 m + 5 % of d.
-    way_m = distance_m + reading * (accuracy_m + reference_m)
-    for odometer_m in ((way_m + 5.0) / 0.95, (way_m - 5.0) / 1.05):
+    chainage_m = distance_m + reading * (accuracy_m + reference_m)
+    for odometer_m in ((chainage_m + 5.0) / 0.95, (chainage_m - 5.0) / 1.05):
         window = expectation_window(distance_m, accuracy_m, reference_m, CONFIG)
         assert window.open_m - 1e-9 <= odometer_m <= window.close_m + 1e-9
 

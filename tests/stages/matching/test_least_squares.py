@@ -21,8 +21,8 @@ def test_over_an_outage_the_odometer_tells_which_way_was_taken(name: str) -> Non
     length = float(np.hypot(*np.diff(points, axis=0).T).sum())
     at = np.arange(50.0, length - 50.0, 20.0)
     x, y = along(points, at)
-    seen = (x < 480.0) | (x > 1520.0)
-    fixes = run(x, y, fix=np.where(seen, "sbas", "none"))
+    has_fix = (x < 480.0) | (x > 1520.0)
+    fixes = run(x, y, fix=np.where(has_fix, "sbas", "none"))
     found = matched(fixes, site(WAYS, LINKS), odometer(at))
     assert found.path.element_names() == ["in", name, "out"]
     known = found.epochs.table["path_m"].is_not_null().to_numpy()

@@ -113,8 +113,8 @@ def test_a_tunnel_is_bridged_and_elements_without_fixes_are_there() -> None:
     links: list[Link] = [(p, 1, q, 0, "both") for p, q in ("ab", "bc", "cd", "de")]
     links.append(("a", 1, "side", 0, "both"))
     x = np.arange(100.0, 1900.0, 20.0)
-    seen = (x < 350) | (x > 1650)
-    fixes = run(x, np.zeros(len(x)), fix=np.where(seen, "sbas", "none"))
+    has_fix = (x < 350) | (x > 1650)
+    fixes = run(x, np.zeros(len(x)), fix=np.where(has_fix, "sbas", "none"))
     for distance in (odometer(x), None):
         found = matched(fixes, site(elements, links), distance)
         assert found.path.element_names() == list("abcde")
@@ -247,10 +247,10 @@ def test_a_network_in_pieces_is_crossed_with_a_break() -> None:
     elements = {"w": line((0, 0), (500, 0)), "e": line((1200, 0), (700, 0)), "x": line((500, 0), (400, 300))}
     place = site(elements, [("w", 1, "x", 0, "both")])
     whole = np.arange(100.0, 1100.0, 10.0)
-    seen = (whole < 500.0) | (whole >= 700.0)
-    found = matched(run(whole, np.zeros(len(whole))).filter(pl.Series(seen)), place, odometer(whole))
+    has_fix = (whole < 500.0) | (whole >= 700.0)
+    found = matched(run(whole, np.zeros(len(whole))).filter(pl.Series(has_fix)), place, odometer(whole))
     assert [leg.visits[0].forward for leg in found.path.legs] == [True, False]
-    assert np.allclose(found.epochs.table["path_m"], whole[seen], atol=15.0)
+    assert np.allclose(found.epochs.table["path_m"], whole[has_fix], atol=15.0)
     assert found.epochs.table["netelement_id"].unique().sort().to_list() == ["e", "w"]
 
 

@@ -76,9 +76,9 @@ def test_nothing_is_claimed_off_the_reviewed_path_and_nothing_near_it_is_lost(nu
     assert sure.height > 0.6 * epochs["on_track"].sum()
     assert set(sure["netelement_id"]) <= set(known)
     # Three elements of the first recording lie more than 50 m from every position.
-    unseen = {"88_L_3955", "88_L_5977", "88_L_7820"} if number == 28573 else set()
-    unseen = set(known[8:13]) if number == 31241 else unseen
-    assert set(known) - unseen <= set(epochs["netelement_id"])
+    without_fixes = {"88_L_3955", "88_L_5977", "88_L_7820"} if number == 28573 else set()
+    without_fixes = set(known[8:13]) if number == 31241 else without_fixes
+    assert set(known) - without_fixes <= set(epochs["netelement_id"])
 
 
 def test_positions_off_every_track_are_said_to_be_and_the_way_meanwhile_is_in_doubt(network: Site) -> None:

@@ -21,8 +21,8 @@ def latitudes(seed=0, count=4000):
     """A train that gathers and loses speed northwards, with the noise of a receiver."""
     rng = np.random.default_rng(seed)
     t = 0.1 * np.arange(count)
-    way_m = 20.0 * t + 100.0 * np.sin(t / 30.0) + rng.normal(0.0, 0.05, count).cumsum() * 0.1
-    return 50.8 + way_m / _PER_DEG_M
+    chainage_m = 20.0 * t + 100.0 * np.sin(t / 30.0) + rng.normal(0.0, 0.05, count).cumsum() * 0.1
+    return 50.8 + chainage_m / _PER_DEG_M
 
 
 @pytest.mark.parametrize("step_deg", [1e-6, 1e-5, 1.0 / 600_000.0, 1.0 / 60_000.0, 2.0**-18])

@@ -26,7 +26,7 @@ class Drawn:
     links: list[Link]
     x_m: Floats
     y_m: Floats
-    way_m: Floats
+    chainage_m: Floats
     begin_ns: int = 0
     first_names: dict[str, str] = field(default_factory=dict)
 
@@ -54,7 +54,7 @@ def drawn(seed: int) -> Drawn:
 
 
 def replayed(world: Drawn) -> Match:
-    fixes, way = run(world.x_m, world.y_m, sigma_m=0.3), odometer(world.way_m)
+    fixes, way = run(world.x_m, world.y_m, sigma_m=0.3), odometer(world.chainage_m)
     place = site(world.elements, world.links, sigma_m=0.3)
     later = (pl.col("t").cast(pl.Int64) + world.begin_ns).cast(pl.Datetime("ns", "UTC"))
     return matched(fixes.with_columns(later), place, way.with_columns(later))
@@ -162,7 +162,7 @@ def test_nothing_live_changes_before_a_cut(seed: int) -> None:
     world, found = as_drawn(seed)
     whole = floats(found.epochs.table, "gate_probability")
     for count in (25, 60, 100, 140):
-        part = replace(world, x_m=world.x_m[:count], y_m=world.y_m[:count], way_m=world.way_m[:count])
+        part = replace(world, x_m=world.x_m[:count], y_m=world.y_m[:count], chainage_m=world.chainage_m[:count])
         assert np.array_equal(floats(replayed(part).epochs.table, "gate_probability"), whole[:count], equal_nan=True)
 
 

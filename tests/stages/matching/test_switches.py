@@ -34,21 +34,23 @@ def turnout(cut_m: float = 400.0) -> Site:
     return site(elements, links, sigma_m=0.02)
 
 
-def claimed_at_m(way_m: Floats, place: Site) -> Floats:
+def claimed_at_m(chainage_m: Floats, place: Site) -> Floats:
     """Of exact positions along stem and branch, the ways behind the switch [m] at which the branch is claimed."""
-    x_m = np.where(way_m < 0.0, way_m, way_m * np.cos(ANGLE))
-    y_m = np.where(way_m < 0.0, 0.0, way_m * np.sin(ANGLE))
-    epochs = matched(run(x_m, y_m, sigma_m=0.02), place, odometer(np.abs(way_m - way_m[0]))).epochs.table
+    x_m = np.where(chainage_m < 0.0, chainage_m, chainage_m * np.cos(ANGLE))
+    y_m = np.where(chainage_m < 0.0, 0.0, chainage_m * np.sin(ANGLE))
+    epochs = matched(run(x_m, y_m, sigma_m=0.02), place, odometer(np.abs(chainage_m - chainage_m[0]))).epochs.table
     on_branch = np.array([name is not None and name[0] == "d" for name in epochs["netelement_id"].to_list()])
-    return way_m[on_branch & (np.nan_to_num(floats(epochs, "gate_probability")) >= 0.99)]
+    return chainage_m[on_branch & (np.nan_to_num(floats(epochs, "gate_probability")) >= 0.99)]
 
 
 @pytest.mark.parametrize("cut_m", [400.0, 10.0, 4.0])
 def test_branches_are_one_track_until_they_are_a_gauge_apart(cut_m: float) -> None:
     network = network_in_pieces(turnout(cut_m))
-    way_m = np.arange(-50.0, -10.0)
-    latitude, longitude = degrees(way_m, np.zeros(way_m.size))
-    steps = path_steps((way_m * 1e9).astype(np.int64), points_of(latitude, longitude), np.full(way_m.size, 0.02))
+    chainage_m = np.arange(-50.0, -10.0)
+    latitude, longitude = degrees(chainage_m, np.zeros(chainage_m.size))
+    steps = path_steps(
+        (chainage_m * 1e9).astype(np.int64), points_of(latitude, longitude), np.full(chainage_m.size, 0.02)
+    )
     one_track = SwitchZones(path_set(steps, network, MatchingConfig()), 1.5)
     branch = network.track.ids.index("d0")
     assert one_track.zone_beyond(2 * branch + 1).length_m == pytest.approx(APART_M, abs=0.1)

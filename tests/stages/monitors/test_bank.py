@@ -8,13 +8,13 @@ from typing import Any, cast
 import numpy as np
 import polars as pl
 import pytest
-from schemas.monitors import BANK_MONITORS
 
 from pipeline.stages.epochs.verdicts import DISABLED, NO_ODOMETER, NO_POSITION, NO_VALUE, first_reason, verdicts
 from pipeline.stages.monitors.axes import NO_HEIGHT, OFF_TRACK
 from pipeline.stages.monitors.bank import FIRST_EPOCH, MonitorBank
 from pipeline.stages.monitors.single import NO_VELOCITY, channel_monitor, doppler_monitor, paired
 from schemas.config import Configuration, Vehicle, threshold_factor
+from schemas.monitors import BANK_MONITORS
 from schemas.stages import AlignedEpochs
 from tests.arrays_of_table import arrays_of_table
 from tests.frames import bank_over, verdict_table

@@ -17,8 +17,8 @@ MISSING_M = 10.0 * (6.7 + 10.0)
 
 def sliding(speeds_mps: Floats, wheel_mps: Floats | None = None) -> Odometry:
     wheel_mps = np.interp(T_S, KNOTS_S, WHEEL_MPS) if wheel_mps is None else wheel_mps
-    way_m = np.concatenate([[0.0], np.cumsum(0.05 * (wheel_mps[1:] + wheel_mps[:-1]))])
-    return odometry_from(odometer_of(T_S, distance_m=way_m, speed_mps=speeds_mps))
+    travelled_m = np.concatenate([[0.0], np.cumsum(0.05 * (wheel_mps[1:] + wheel_mps[:-1]))])
+    return odometry_from(odometer_of(T_S, distance_m=travelled_m, speed_mps=speeds_mps))
 
 
 def at_ns(odometry: Odometry, *at_s: float) -> Ints:
@@ -60,15 +60,15 @@ def test_speeds_do_not_contradict_a_distance_that_is_read_with_noise(seed: int) 
     rng = np.random.default_rng(seed)
     t_s = np.arange(0.0, 400.0, 0.05)
     mps = np.interp(t_s, [0.0, 20.0, 60.0, 80.0, 100.0, 140.0, 400.0], [0.0, 12.0, 12.0, 0.0, 0.0, 16.0, 9.0])
-    way_m = np.cumsum(mps) * 0.05 + rng.normal(0.0, 2.0, t_s.size)
-    assert odometry_from(odometer_of(t_s, distance_m=way_m, speed_mps=mps)).doubt_m[-1] == 0.0
+    travelled_m = np.cumsum(mps) * 0.05 + rng.normal(0.0, 2.0, t_s.size)
+    assert odometry_from(odometer_of(t_s, distance_m=travelled_m, speed_mps=mps)).doubt_m[-1] == 0.0
 
 
 def test_what_is_known_of_it_does_not_depend_on_later_rows() -> None:
     speeds_mps = np.full(T_S.size, 20.0)
     whole = sliding(speeds_mps).doubt_m
     wheel_mps = np.interp(T_S, KNOTS_S, WHEEL_MPS)
-    way_m = np.concatenate([[0.0], np.cumsum(0.05 * (wheel_mps[1:] + wheel_mps[:-1]))])
+    travelled_m = np.concatenate([[0.0], np.cumsum(0.05 * (wheel_mps[1:] + wheel_mps[:-1]))])
     for rows in (640, 700, 760, 800, 900):
-        cut = odometry_from(odometer_of(T_S[:rows], distance_m=way_m[:rows], speed_mps=speeds_mps[:rows]))
+        cut = odometry_from(odometer_of(T_S[:rows], distance_m=travelled_m[:rows], speed_mps=speeds_mps[:rows]))
         assert cut.doubt_m.tolist() == whole[:rows].tolist()

@@ -49,8 +49,8 @@ def test_rows_that_scatter_at_a_stand_are_not_under_way():
     """Half a metre from row to row at 5 Hz looks like 2.5 m/s; from 20 s on the train drives 5 m/s."""
     t_s = np.arange(0.0, 40.0, 0.2)
     rows_m = 5.0 * np.maximum(t_s - 20.0, 0.0) + np.random.default_rng(1).normal(0.0, 0.5, t_s.size)
-    way_m = travelled_m(t_s, rows_m, np.full(t_s.size, 2.5), 0.3, 1.0)
-    moving = is_moving(t_s, way_m, 0.3, 1.0)
+    run_m = travelled_m(t_s, rows_m, np.full(t_s.size, 2.5), 0.3, 1.0)
+    moving = is_moving(t_s, run_m, 0.3, 1.0)
     assert not moving[t_s < 20.0].any()
     assert moving[t_s > 21.5].mean() > 0.9
 

@@ -58,7 +58,7 @@ def test_speed_alone_is_integrated_and_guessed_over_a_pause():
 
 
 @pytest.mark.parametrize(
-    ("before_mps", "after_mps", "pause_s", "way_m", "doubt_m"),
+    ("before_mps", "after_mps", "pause_s", "travelled_m", "doubt_m"),
     [
         (0.0, 0.0, 45.0, 0.0, 0.0),
         # From rest in a period of 0.5 s, half of which is sure.
@@ -72,11 +72,11 @@ def test_speed_alone_is_integrated_and_guessed_over_a_pause():
     ],
 )
 def test_a_logger_that_writes_nothing_at_a_stand_leaves_little_in_doubt(
-    before_mps, after_mps, pause_s, way_m, doubt_m
+    before_mps, after_mps, pause_s, travelled_m, doubt_m
 ) -> None:
     t = [0.0, 0.5, 1.0, 1.5, 1.5 + pause_s, 2.0 + pause_s, 2.5 + pause_s]
     odometry = odometry_from(odometer_of(t, speed_mps=[*[before_mps] * 4, *[after_mps] * 3]))
-    assert np.diff(odometry.distance_m)[3] == pytest.approx(way_m)
+    assert np.diff(odometry.distance_m)[3] == pytest.approx(travelled_m)
     assert np.diff(odometry.doubt_m) == pytest.approx([0.0, 0.0, 0.0, doubt_m, 0.0, 0.0])
 
 

@@ -15,7 +15,7 @@ K_T = 5.3267238
 
 
 @pytest.mark.parametrize(
-    ("positions_m2", "elapsed_s", "way_m", "sigma_scale", "bound_m"),
+    ("positions_m2", "elapsed_s", "travelled_m", "sigma_scale", "bound_m"),
     [
         (2.0, 0.0, 0.0, 0.0, K_T * sqrt(2.0)),
         (2.0, 100.0, 0.0, 0.0, K_T * sqrt(2.0 + 0.05**2 * 100.0)),
@@ -27,9 +27,9 @@ K_T = 5.3267238
     ],
 )
 def test_the_bound_is_of_both_positions_and_the_odometer_up_to_half_the_failure_limit(
-    positions_m2: float, elapsed_s: float, way_m: float, sigma_scale: float, bound_m: float
+    positions_m2: float, elapsed_s: float, travelled_m: float, sigma_scale: float, bound_m: float
 ) -> None:
-    variance_m2 = RULE.variance_m2(positions_m2, elapsed_s, way_m, sigma_scale)
+    variance_m2 = RULE.variance_m2(positions_m2, elapsed_s, travelled_m, sigma_scale)
     assert float(RULE.bound_m(variance_m2)) == pytest.approx(bound_m)
 
 

@@ -83,23 +83,25 @@ def test_a_train_that_stands_shows_nothing() -> None:
 def test_one_change_of_speed_that_comes_with_a_step_is_no_lag() -> None:
     """From 34 to 28 m/s just as the other recorder steps back by 31 m: that looks like a lag of 5 s."""
     t_s = np.arange(0.0, 900.0, 0.1)
-    way_m = np.cumsum(np.interp(t_s, [440.0, 452.0], [34.0, 28.0])) * 0.1
+    travelled_m = np.cumsum(np.interp(t_s, [440.0, 452.0], [34.0, 28.0])) * 0.1
     begin_s = np.arange(20.0, 850.0, 2.0)
-    place_m = np.interp(t_s, t_s, way_m) - 31.0 * (t_s > 446.0)
+    place_m = np.interp(t_s, t_s, travelled_m) - 31.0 * (t_s > 446.0)
     place_m = place_m + np.random.default_rng(3).normal(0.0, 0.5, t_s.size)
     ways_m = np.interp(begin_s + 10.0, t_s, place_m) - np.interp(begin_s, t_s, place_m)
-    found = scale_and_lag(begin_s, begin_s + 10.0, ways_m, CounterRows(t_s, way_m, np.zeros(t_s.size)))
+    found = scale_and_lag(begin_s, begin_s + 10.0, ways_m, CounterRows(t_s, travelled_m, np.zeros(t_s.size)))
     assert not found.measured or abs(found.lag_s) < 4.0 * found.lag_sigma_s
 
 
 def drifting(begin_s: float, end_s: float, rate_mps: float, speeds: tuple[list[float], list[float]]) -> ScaleLag:
     """The other recorder, exact to 0.1 m and in time, walks away at this rate between these instants."""
     t_s = np.arange(0.0, speeds[0][-1], 0.05)
-    way_m = np.cumsum(np.interp(t_s, *speeds)) * 0.05
-    place_m = way_m + rate_mps * np.clip(t_s - begin_s, 0.0, end_s - begin_s)
+    travelled_m = np.cumsum(np.interp(t_s, *speeds)) * 0.05
+    place_m = travelled_m + rate_mps * np.clip(t_s - begin_s, 0.0, end_s - begin_s)
     at_s = np.arange(2.0, t_s[-1] - 2.0, 2.0)
-    seen_m = np.interp(at_s, t_s, place_m) + np.random.default_rng(4).normal(0.0, 0.1, at_s.size)
-    return scale_and_lag(at_s[:-5], at_s[5:], seen_m[5:] - seen_m[:-5], CounterRows(t_s, way_m, np.zeros(t_s.size)))
+    measured_m = np.interp(at_s, t_s, place_m) + np.random.default_rng(4).normal(0.0, 0.1, at_s.size)
+    return scale_and_lag(
+        at_s[:-5], at_s[5:], measured_m[5:] - measured_m[:-5], CounterRows(t_s, travelled_m, np.zeros(t_s.size))
+    )
 
 
 def test_a_drift_as_long_as_the_only_change_of_speed_is_no_lag() -> None:
@@ -161,9 +163,11 @@ def test_ways_at_one_speed_say_nothing_of_a_lag() -> None:
 
 def test_a_slip_widens_what_is_possible() -> None:
     """Of eight ways one is 12 m too long: it hides the lag, and is no reason to believe in none."""
-    begin_s, end_s, way_m = recorded(8, 1.2)
-    slipped = way_m + 12.0 * (np.arange(8) == 3)
-    clean, wide = (possible_lags((begin_s, end_s, way), counter(), np.ones(8), 0.05, 3.0) for way in (way_m, slipped))
+    begin_s, end_s, travelled_m = recorded(8, 1.2)
+    slipped = travelled_m + 12.0 * (np.arange(8) == 3)
+    clean, wide = (
+        possible_lags((begin_s, end_s, way), counter(), np.ones(8), 0.05, 3.0) for way in (travelled_m, slipped)
+    )
     assert clean is not None
     assert wide is not None
     assert wide[1] - wide[0] > clean[1] - clean[0]
@@ -180,8 +184,8 @@ def test_the_true_lag_is_hardly_ever_refuted() -> None:
             float(dice.uniform(-3.0, 3.0)),
             float(dice.uniform(0.96, 1.04)),
         )
-        begin_s, end_s, way_m = recorded(count, late_s, float(dice.uniform(200.0, 3000.0)))
-        noisy = scale * way_m + np.diff(dice.normal(0.0, 1.0, count + 1))
+        begin_s, end_s, travelled_m = recorded(count, late_s, float(dice.uniform(200.0, 3000.0)))
+        noisy = scale * travelled_m + np.diff(dice.normal(0.0, 1.0, count + 1))
         found = possible_lags((begin_s, end_s, noisy), counter(), np.full(count, 2.0), 0.05, 3.0)
         missed += found is not None and not found[0] <= late_s <= found[1]
     assert missed <= 3

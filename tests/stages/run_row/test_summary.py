@@ -10,7 +10,6 @@ import polars as pl
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from schemas.monitors import SCALES
 
 from pipeline.stages.judge.judge import Judged
 from pipeline.stages.judge.judged import JudgedEpochs
@@ -19,6 +18,7 @@ from pipeline.stages.run_row.lost_time import lost_columns
 from pipeline.stages.run_row.summary import SolutionResults, failed_row, summarise
 from schemas.config import Configuration, LdsConfig
 from schemas.enums import Evidence, Note, VehicleFigures
+from schemas.monitors import SCALES
 from schemas.run import IngestNotes
 from schemas.tables import CONTRACT_VERSION, Runs
 from schemas.words import Remark

@@ -18,8 +18,8 @@ GEOD = pyproj.Geod(ellps="WGS84")
 def test_a_place_moved_300_m_east_and_400_m_north_is_500_m_away(latitude: float) -> None:
     at = np.array([latitude]), np.array([4.0]), np.zeros(1)
     to_latitude, to_longitude = moved_deg(*at, np.array([300.0]), np.array([400.0]))
-    azimuth, _, way_m = GEOD.inv(4.0, latitude, to_longitude[0], to_latitude[0])
-    assert way_m == pytest.approx(500.0, abs=0.03)
+    azimuth, _, distance_m = GEOD.inv(4.0, latitude, to_longitude[0], to_latitude[0])
+    assert distance_m == pytest.approx(500.0, abs=0.03)
     assert azimuth == pytest.approx(np.degrees(np.arctan2(3.0, 4.0)), abs=0.01)
 
 

@@ -122,18 +122,18 @@ def test_sigmas_of_an_earlier_calibration_do_not_count(
     assert again.monitors == result.monitors
 
 
-def seen(run_id: str, noise_m: dict[str, tuple[float, ...]], alarms: tuple[str, ...] = ()) -> ObservedRun:
+def observed(run_id: str, noise_m: dict[str, tuple[float, ...]], alarms: tuple[str, ...] = ()) -> ObservedRun:
     return ObservedRun(run_id, RunEstimate(1.0, 1e-4, 0.0, 0.01, 100), noise_m, None, alarms)
 
 
 def test_runs_that_failed_beyond_their_noise_are_named() -> None:
-    runs = [seen("good", {}), seen("bad", {}, ("along_ewma_0p01",))]
+    runs = [observed("good", {}), observed("bad", {}, ("along_ewma_0p01",))]
     assert combine_runs(runs, Vehicle(), Configuration()).alarms == {"bad": ("along_ewma_0p01",)}
 
 
 def test_the_loudest_run_counts_monitor_by_monitor_and_an_axis_unknown_to_all_stays_unset() -> None:
-    one = seen("one", {"noise_along_m": (0.1, 0.1, 0.4, 0.4), "noise_cross_m": (0.0, 0.0, 0.0, 0.0)})
-    other = seen("other", {"noise_along_m": (0.2, 0.3, 0.3, 0.3)})
+    one = observed("one", {"noise_along_m": (0.1, 0.1, 0.4, 0.4), "noise_cross_m": (0.0, 0.0, 0.0, 0.0)})
+    other = observed("other", {"noise_along_m": (0.2, 0.3, 0.3, 0.3)})
     found = combine_runs([one, other], Vehicle(), Configuration())
     assert found.monitors == {"noise_along_m": (0.2, 0.3, 0.4, 0.4), "noise_cross_m": (0.0, 0.0, 0.0, 0.0)}
 

@@ -381,8 +381,8 @@ def test_a_limit_of_speed_is_that_of_the_fastest_instant() -> None:
     """20 to 200 km/h and back in 10 s, 4.2 km/h too fast: 2 + 170 / 47 = 5.6 is allowed at 200, 3.7 at 110 km/h."""
     seconds = [float(second) for second in range(11)]
     speed_mps = (200.0 - 36.0 * np.abs(np.arange(11) - 5.0)) / 3.6
-    way_m = np.concatenate([[0.0], np.cumsum(0.5 * (speed_mps[1:] + speed_mps[:-1]))])
-    true_m = (way_m - 4.2 / 3.6 * np.array(seconds)).tolist()
+    travelled_m = np.concatenate([[0.0], np.cumsum(0.5 * (speed_mps[1:] + speed_mps[:-1]))])
+    true_m = (travelled_m - 4.2 / 3.6 * np.array(seconds)).tolist()
     found = speed_errors(
         front(seconds, speed_mps=speed_mps.tolist(), path_m=true_m, error_low_m=-0.1, error_high_m=0.1), 10.0
     )

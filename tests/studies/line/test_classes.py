@@ -130,8 +130,8 @@ def test_what_the_reference_lost_counts_against_a_piece(site: Site) -> None:
     assert found["loss_high"] == pytest.approx(0.2167, abs=1e-4)
     assert found["loss_low"] == 0.0
     # Where the evidence is of reads they are no trials.
-    unseen = many.with_columns(pl.col("state").replace(int(SpanState.UNKNOWN), int(SpanState.NOT_COVERED)))
-    assert classes(unseen, site).row(by_predicate=place, named=True)["word"] == "suitable"
+    not_covered = many.with_columns(pl.col("state").replace(int(SpanState.UNKNOWN), int(SpanState.NOT_COVERED)))
+    assert classes(not_covered, site).row(by_predicate=place, named=True)["word"] == "suitable"
 
 
 def test_a_wrong_position_after_a_gap_is_wrong_there_and_not_along_it(site: Site) -> None:

@@ -103,18 +103,18 @@ class _Line:
         where = float(rng.uniform(40.0, 60.0)), float(rng.choice([rng.uniform(2.0, 25.0), rng.uniform(-9.0, -3.0)]))
         return cls(begin_m, end_m, at, east, north, *where, float(rng.uniform(80.0, 600.0)))
 
-    def places(self, way_m: Floats, off: Floats | None = None) -> tuple[Floats, Floats, Floats]:
+    def places(self, chainage_m: Floats, off: Floats | None = None) -> tuple[Floats, Floats, Floats]:
         """Latitude, longitude [deg] and height [m] of ways along the line, moved by east and north."""
-        off = np.zeros((way_m.size, 2)) if off is None else off
-        east = np.interp(way_m, self.at_m, self.east_m) + off[:, 0]
-        north = np.interp(way_m, self.at_m, self.north_m) + off[:, 1]
+        off = np.zeros((chainage_m.size, 2)) if off is None else off
+        east = np.interp(chainage_m, self.at_m, self.east_m) + off[:, 0]
+        north = np.interp(chainage_m, self.at_m, self.north_m) + off[:, 1]
         latitude = np.radians(self.latitude_deg) + north / _meridian_m(self.latitude_deg)
         longitude = self.longitude_deg + np.degrees(east / (_normal_m(np.degrees(latitude)) * np.cos(latitude)))
-        return np.degrees(latitude), longitude, self.height_m + 40.0 * np.sin(way_m / 2500.0)
+        return np.degrees(latitude), longitude, self.height_m + 40.0 * np.sin(chainage_m / 2500.0)
 
-    def heading(self, way_m: Floats) -> Floats:
-        ahead = np.column_stack([np.interp(way_m + 2.5, self.at_m, one) for one in (self.east_m, self.north_m)])
-        behind = np.column_stack([np.interp(way_m - 2.5, self.at_m, one) for one in (self.east_m, self.north_m)])
+    def heading(self, chainage_m: Floats) -> Floats:
+        ahead = np.column_stack([np.interp(chainage_m + 2.5, self.at_m, one) for one in (self.east_m, self.north_m)])
+        behind = np.column_stack([np.interp(chainage_m - 2.5, self.at_m, one) for one in (self.east_m, self.north_m)])
         return np.asarray((ahead - behind) / 5.0)
 
     def site(self, balises_m: Floats) -> Site:

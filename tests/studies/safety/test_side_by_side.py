@@ -122,8 +122,8 @@ class TestFaults:
     def test_the_odometer_alone_judges_no_share(self) -> None:
         gps, galileo = solution("gps", during(50, 69, 40.0)), solution("galileo")
         faults = rows_of(fault("gps", 50, 50, 70), fault("gps", 100, 100, 120))
-        seen = pl.Series("evidence", ["odometer", "reference"]).cast(faults.schema["evidence"])
-        row = compared(gps, galileo, faults=faults.with_columns(seen))["gps", REACTIVE]
+        kinds = pl.Series("evidence", ["odometer", "reference"]).cast(faults.schema["evidence"])
+        row = compared(gps, galileo, faults=faults.with_columns(kinds))["gps", REACTIVE]
         assert (row["failures"], row["missed"], row["failures_judged"], row["missed_judged"]) == (2, 2, 1, 1)
         assert row["missed_share_low"] == clopper_pearson(1, 1).low
         blind = faults.with_columns(pl.lit("odometer", faults.schema["evidence"]).alias("evidence"))

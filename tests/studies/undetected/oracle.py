@@ -51,8 +51,8 @@ def rows(rng: np.random.Generator, size: int, resets: int = 0, levels: bool = Fa
         alphas, dt_s, rate, fresh, limits[:, 0], limits[:, 1:], start, np.full(size, -np.inf), np.full(size, np.inf)
     )
     # A threshold that the recorded noise itself exceeds would be an alarm: lift it.
-    seen = recursions(made, np.zeros(size))
-    made.ewma_mps = np.maximum(made.ewma_mps, 1.3 * np.abs(seen))
+    averages = recursions(made, np.zeros(size))
+    made.ewma_mps = np.maximum(made.ewma_mps, 1.3 * np.abs(averages))
     if levels:
         made.high_m = rng.uniform(4.0, 9.0, size)
         made.low_m = -rng.uniform(4.0, 9.0, size)
@@ -128,7 +128,7 @@ def optimum(window: Rows) -> float:
 def watched(window: Rows) -> Watched:
     """The same rows as the program has them."""
     alphas, size = np.array(window.alphas), window.size
-    unseen = np.where(window.fresh, np.inf, 1.0)
+    unlimited = np.where(window.fresh, np.inf, 1.0)
     averages = recursions(window, np.zeros(size))
     averages[0] = window.start_mps
     infinite, zero = np.full(size, np.inf), np.zeros(size)
@@ -140,11 +140,11 @@ def watched(window: Rows) -> Watched:
         fastest_m=window.largest_mps * window.dt_s,
         gain_s=window.dt_s,
         rate_mps=window.rate_mps,
-        least_mps=np.maximum(-window.raw_mps * unseen, window.rate_mps - window.largest_mps),
-        most_mps=np.minimum(window.raw_mps * unseen, window.rate_mps + window.largest_mps),
+        least_mps=np.maximum(-window.raw_mps * unlimited, window.rate_mps - window.largest_mps),
+        most_mps=np.minimum(window.raw_mps * unlimited, window.rate_mps + window.largest_mps),
         weight=1.0 - (1.0 - alphas[None, :]) ** window.dt_s[:, None],
         average_mps=averages,
-        threshold_mps=window.ewma_mps * unseen[:, None],
+        threshold_mps=window.ewma_mps * unlimited[:, None],
         low_m=window.low_m,
         high_m=window.high_m,
         anchor=np.full(size, NO_ROW),

@@ -18,7 +18,7 @@ from schemas.config import Configuration
 from tests.studies.undetected.oracle import watched
 from tests.studies.undetected.test_errors import constant
 
-WAY_M = 30.0 * np.arange(10)
+TRAVELLED_M = 30.0 * np.arange(10)
 
 
 def settings(limit_m: float, resolution_s: float = 0.0) -> Configuration:
@@ -49,7 +49,7 @@ def test_balises_may_be_as_far_apart_as_the_error_stays_within_the_limit(
         return search(both, start, **rest)
 
     monkeypatch.setattr(spacing, "_first_beyond", counted)
-    found, _ = largest_spacing(watched(constant(10, 0.01, 0.02)), WAY_M, settings(limit_m))
+    found, _ = largest_spacing(watched(constant(10, 0.01, 0.02)), TRAVELLED_M, settings(limit_m))
     assert found.distance_m == (None if spacing_m is None else pytest.approx(spacing_m))
     # 0 m cannot become less: only the first starts are tried.
     assert starts is None or len(searched) == starts
@@ -67,7 +67,7 @@ def test_balises_may_be_as_far_apart_as_the_error_stays_within_the_limit(
     ],
 )
 def test_starts_lie_no_nearer_than_the_resolution(resolution_s: float, spacing_m: float) -> None:
-    found, _ = largest_spacing(watched(constant(10, 0.01, 0.02)), WAY_M, settings(0.525, resolution_s))
+    found, _ = largest_spacing(watched(constant(10, 0.01, 0.02)), TRAVELLED_M, settings(0.525, resolution_s))
     assert found.distance_m == pytest.approx(spacing_m)
 
 

@@ -27,13 +27,13 @@ RESETS = [(seed, 40, 2) for seed in range(100, 102)]
 @pytest.mark.parametrize(("seed", "size", "resets"), CASES + RESETS)
 def test_optimum_and_bound_are_those_of_the_definition(seed: int, size: int, resets: int) -> None:
     window = rows(np.random.default_rng(seed), size, resets)
-    seen = watched(window)
-    found = largest_profile(seen)
+    monitored = watched(window)
+    found = largest_profile(monitored)
     most = optimum(window)
     assert found.error_m == pytest.approx(most, abs=1e-5)
-    bound = bounds(seen).most_m[-1]
+    bound = bounds(monitored).most_m[-1]
     assert most - 1e-6 <= bound <= 1.1 * most
-    # The profile itself: silent by the recursion as printed, and no longer so 5 % larger.
+    # The profile itself: not detected by the recursion as printed, and no longer so 5 % larger.
     assert beyond(window, found.fault_m) <= 1.0 + 1e-6
     if not resets:
         assert beyond(window, 1.05 * found.fault_m) > 1.0
@@ -49,9 +49,9 @@ def test_behind_is_ahead_of_the_mirrored_record() -> None:
 @pytest.mark.parametrize("seed", range(2))
 def test_tests_of_the_position_bound_it_there_and_after(seed: int) -> None:
     window = rows(np.random.default_rng(seed), 35, levels=True)
-    seen, most = watched(window), optimum(window)
-    assert largest_profile(seen).error_m == pytest.approx(most, abs=1e-5)
-    assert most - 1e-6 <= bounds(seen).most_m[-1] <= 1.1 * most
+    monitored, most = watched(window), optimum(window)
+    assert largest_profile(monitored).error_m == pytest.approx(most, abs=1e-5)
+    assert most - 1e-6 <= bounds(monitored).most_m[-1] <= 1.1 * most
 
 
 @pytest.mark.parametrize(("look_back_s", "beyond_m"), [(30.0, 1.31), (60.0, 0.47)])
@@ -60,8 +60,8 @@ def test_a_test_of_the_position_is_looked_back_at_for_so_long(look_back_s: float
     window = constant(201, 1.0, 0.02)
     window.raw_mps = np.full(201, 0.01)
     tested = (np.arange(201) > 0) & (np.arange(201) <= 100)
-    seen = replace(watched(window), high_m=np.where(tested, 0.1, np.inf))
-    found = largest_errors(seen, UndetectedConfig(look_back_s=look_back_s)).most_m
+    monitored = replace(watched(window), high_m=np.where(tested, 0.1, np.inf))
+    found = largest_errors(monitored, UndetectedConfig(look_back_s=look_back_s)).most_m
     assert found[99] == pytest.approx(0.1, abs=1e-9)
     assert found[[129, 130]] == pytest.approx([0.4 if look_back_s == 30.0 else 0.47, beyond_m], abs=1e-9)
 
@@ -87,7 +87,7 @@ def test_an_average_already_at_its_threshold_lets_pass_the_slope_alone() -> None
     assert bounds(watched(window)).most_m[-1] == pytest.approx(0.50, abs=1e-9)
 
 
-def test_where_the_bank_began_anew_the_fault_may_have_changed_unseen() -> None:
+def test_where_the_bank_began_anew_the_fault_may_have_changed_undetected() -> None:
     window = constant(21, 0.01, 0.02)
     window.largest_mps, window.fresh[10], window.dt_s[10] = 5.0, True, 90.0
     window.raw_mps = np.full(21, 0.1)
@@ -107,8 +107,8 @@ def test_a_relink_bounds_the_fault_against_its_anchor() -> None:
     window.fresh[20] = True
     anchor, high = np.full(31, -1), np.full(31, np.inf)
     anchor[20], high[20] = 10, 3.0
-    seen = replace(watched(window), anchor=anchor, held_high_m=high, held_low_m=-high)
-    found, bound = largest_profile(seen.after_fix(0, 20)).error_m, bounds(seen.after_fix(0, 20)).most_m
+    monitored = replace(watched(window), anchor=anchor, held_high_m=high, held_low_m=-high)
+    found, bound = largest_profile(monitored.after_fix(0, 20)).error_m, bounds(monitored.after_fix(0, 20)).most_m
     # Ten rows by hand as above, and three metres.
     assert found == pytest.approx(0.5 + 0.09 + 3.0, abs=1e-6)
     assert bound[9] == pytest.approx(0.59, abs=1e-6)
@@ -119,37 +119,39 @@ def test_a_fault_after_a_fix_between_two_rows_has_only_the_time_since() -> None:
     window = constant(12, 0.01, 0.02)
     window.largest_mps, window.dt_s[1] = 0.001, 50.0
     # By hand: 1 mm/s over the 8 s since the fix, and over ten rows of 1 s.
-    seen = watched(window).after_fix(0, 11, watched(window).t_s[1] - 8.0)
-    assert bounds(seen).most_m[-1] == pytest.approx(0.018, abs=1e-9)
-    assert largest_profile(seen).error_m == pytest.approx(0.018, abs=1e-6)
+    monitored = watched(window).after_fix(0, 11, watched(window).t_s[1] - 8.0)
+    assert bounds(monitored).most_m[-1] == pytest.approx(0.018, abs=1e-9)
+    assert largest_profile(monitored).error_m == pytest.approx(0.018, abs=1e-6)
     fresh = replace(watched(window), fresh=np.arange(12) == 1)
     assert bounds(fresh.after_fix(0, 1, fresh.t_s[1] - 8.0)).most_m[-1] == pytest.approx(0.008, abs=1e-12)
 
 
 def test_starts_that_were_not_tried_leave_no_shorter_spacing() -> None:
-    seen = watched(rows(np.random.default_rng(1), 60))
-    limit_m, way_m = 8.0, 10.0 * seen.t_s
+    monitored = watched(rows(np.random.default_rng(1), 60))
+    limit_m, travelled_m = 8.0, 10.0 * monitored.t_s
     settings = {
         "hazards": {"failure_limit_m": limit_m, "jump_limit_m": limit_m},
         "undetected": {"spacing_step_s": 50.0, "spacing_resolution_s": 0.0},
     }
-    found, before_m = largest_spacing(seen, way_m, Configuration.model_validate(settings))
-    ways, grow = [], partial(bound_growth_with, splits=splits_anywhere(seen))
+    found, before_m = largest_spacing(monitored, travelled_m, Configuration.model_validate(settings))
+    ways, grow = [], partial(bound_growth_with, splits=splits_anywhere(monitored))
     for start in range(59):
         most = np.maximum(
-            *(bounds(one.after_fix(start, 59), grow=grow).most_m for one in (seen, seen.in_other_direction()))
+            *(bounds(one.after_fix(start, 59), grow=grow).most_m for one in (monitored, monitored.in_other_direction()))
         )
         beyond = np.append(np.flatnonzero(most > limit_m), most.size)[0]
         if beyond < most.size:
-            ways.append(way_m[start + beyond] - way_m[start])
+            ways.append(travelled_m[start + beyond] - travelled_m[start])
             # From here on a balise at the start was too far before.
-            assert (before_m[start + 1 + beyond :] < way_m[start + 1 + beyond :] - way_m[start] + 1e-9).all()
+            assert (
+                before_m[start + 1 + beyond :] < travelled_m[start + 1 + beyond :] - travelled_m[start] + 1e-9
+            ).all()
     assert min(ways) > 100.0
     assert found.distance_m is not None
     assert 0.9 * min(ways) - 1e-9 <= found.distance_m <= min(ways) + 1e-9
     assert found.time_s == pytest.approx(found.distance_m / 10.0, abs=1e-9)
     settings["undetected"]["spacing_close_share"] = 0.999
-    coarse, _ = largest_spacing(seen, way_m, Configuration.model_validate(settings))
+    coarse, _ = largest_spacing(monitored, travelled_m, Configuration.model_validate(settings))
     assert coarse.distance_m is not None
     assert coarse.distance_m < 0.9 * min(ways)
 
@@ -166,9 +168,9 @@ def test_any_split_bounds_the_growth() -> None:
 
 def test_a_learned_scale_adds_its_way() -> None:
     window = constant(11, 0.01, 0.02)
-    seen = replace(watched(window), learned_m=np.full(11, 2.0), learned_late_m=np.full(11, 7.0))
+    monitored = replace(watched(window), learned_m=np.full(11, 2.0), learned_late_m=np.full(11, 7.0))
     # 10 rows of 2 m, the latency once, at the end; the bank's own 0.5 + 0.09 beside.
-    assert bounds(seen).most_m[-1] == pytest.approx(0.59 + 20.0 + 7.0, abs=1e-9)
+    assert bounds(monitored).most_m[-1] == pytest.approx(0.59 + 20.0 + 7.0, abs=1e-9)
 
 
 @pytest.mark.parametrize(("shape", "seed", "resets"), [("step", 1, 0), ("ramp", 2, 0), ("step", 3, 1), ("ramp", 3, 1)])

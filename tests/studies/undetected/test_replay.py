@@ -39,11 +39,11 @@ def tables() -> RunTables:
     return replay(run, site, VEHICLE, config())
 
 
-def test_the_profile_goes_unseen_and_five_percent_more_does_not(tmp_path: Path) -> None:
+def test_the_profile_is_not_detected_and_five_percent_more_is(tmp_path: Path) -> None:
     found = proof(3, False, tmp_path)
     assert found is not None
-    assert found.silent
-    assert found.seen_scaled
+    assert found.not_detected
+    assert found.detected_scaled
     assert found.judged_apart_m <= 1e-6
     assert 1.0 <= found.closeness <= 1.1
 
@@ -162,13 +162,13 @@ def test_one_range_may_do_so_much_before_the_monitor_of_ranges_fails(sky: tuple[
     clean, at = replay(run, site, VEHICLE), 9
     most_m, least_m = -np.inf, np.inf
     for name in sorted(satellites.filter(pl.col("used"))["sv"].unique()):
-        reached = _unseen(run, site, clean, name, at)
+        reached = _undetected_m(run, site, clean, name, at)
         most_m, least_m = max(most_m, *reached), min(least_m, *reached)
     assert high_m[at] == pytest.approx(most_m, abs=0.02)
     assert low_m[at] == pytest.approx(least_m, abs=0.02)
 
 
-def _unseen(run: RunLog, site: Site, clean: RunTables, sv: str, at: int) -> list[float]:
+def _undetected_m(run: RunLog, site: Site, clean: RunTables, sv: str, at: int) -> list[float]:
     """Where the sum of squares, a parabola through three replays, meets the threshold; what the position does there."""
     before = clean.epochs.filter(solution="gps")
     sums, moved = [before["pseudorange_value"][at]], [0.0]
