@@ -25,7 +25,7 @@ def read_folder(path: Address, config: IngestConfig, with_digest: bool = True) -
     present = set(files.list_dir(path))
     breaches: list[InputError] = []
     if "gnss.parquet" not in present:
-        breaches.append(_no_gnss(path, present))
+        breaches.append(_no_gnss_error(path, present))
     digest = hashlib.sha256()
     frames: dict[str, pl.DataFrame] = {}
     skipped: list[str] = []
@@ -41,7 +41,7 @@ def read_folder(path: Address, config: IngestConfig, with_digest: bool = True) -
         if with_digest:
             digest.update(f"{stream}:{len(content)}:".encode())
             digest.update(content)
-        recorded = _read(content, stream, str(file), config, breaches)
+        recorded = _read_stream(content, stream, str(file), config, breaches)
         if recorded is not None:
             frames[stream] = conform(recorded, stream, str(file), breaches)
             if stream == "odometer" and not breaches:
@@ -50,7 +50,7 @@ def read_folder(path: Address, config: IngestConfig, with_digest: bool = True) -
             said = notes_of(content)
             held += read_corrections(said, stream, str(file))
             raw_logs += read_raw_logs(said)
-            damages += [*filter(None, [read_damage(said)]), *_lost(stream, content, recorded)]
+            damages += [*filter(None, [read_damage(said)]), *_missing_rows(stream, content, recorded)]
             unproved += [f"{stream}.parquet"] if without_checksums(content) else []
             skipped += [f"{stream}.parquet: column {name}" for name in recorded.columns if not _is_known(name, stream)]
     refuse(breaches)
@@ -69,7 +69,7 @@ def read_folder(path: Address, config: IngestConfig, with_digest: bool = True) -
     ).with_streams(**frames)
 
 
-def _lost(stream: Stream, content: bytes, recorded: pl.DataFrame) -> list[str]:
+def _missing_rows(stream: Stream, content: bytes, recorded: pl.DataFrame) -> list[str]:
     """Rows that a file declares and does not hold."""
     declared = rows_of(content)
     return [f"{stream}.parquet holds {recorded.height} of {declared} rows that are declared"] * (
@@ -77,7 +77,8 @@ def _lost(stream: Stream, content: bytes, recorded: pl.DataFrame) -> list[str]:
     )
 
 
-def _no_gnss(path: Address, present: set[str]) -> InputError:
+def _no_gnss_error(path: Address, present: set[str]) -> InputError:
+    """The error for a folder without positions."""
     return InputError(
         "holds no GNSS stream",
         place=str(path),
@@ -87,21 +88,23 @@ def _no_gnss(path: Address, present: set[str]) -> InputError:
     )
 
 
-def _read(
+def _read_stream(
     content: bytes, stream: Stream, place: str, config: IngestConfig, breaches: list[InputError]
 ) -> pl.DataFrame | None:
+    """One stream of a file with the contract's columns; breaches are appended."""
     if not content:
         breaches.append(InputError("is empty", place=place, found="0 bytes", expected="a Parquet file"))
         return None
     others: list[str] = []
 
-    def known(types: ColumnTypes) -> list[str]:
+    def known_columns(types: ColumnTypes) -> list[str]:
+        """Columns of the contract; names of the others are kept."""
         others.extend(name for name in types if not _is_known(name, stream))
         return [name for name in types if _is_known(name, stream)]
 
     try:
         refuse_too_many(rows_of(content), place, config)
-        frame = read_parquet(content, known)
+        frame = read_parquet(content, known_columns)
     except ParquetError as error:
         breaches.append(
             InputError(f"cannot be read as Parquet ({error})", place=place, remedy="Record or copy the file again.")
