@@ -123,9 +123,9 @@ def settings_markdown() -> str:
     """The whole page."""
     parts = [_INTRODUCTION]
     for name, section in Configuration():
-        parts.append(f"\n## `[{name}]`\n\n{_about(type(section))}\n\n{_table(keys(type(section), f'{name}.'))}")
+        parts.append(f"\n## `[{name}]`\n\n{_class_text(type(section))}\n\n{_table(keys(type(section), f'{name}.'))}")
     for title, model in _TABLES:
-        parts.append(f"\n## {title}\n\n{_about(model)}\n\n{_table(keys(model))}")
+        parts.append(f"\n## {title}\n\n{_class_text(model)}\n\n{_table(keys(model))}")
     return "".join(parts)
 
 
@@ -163,7 +163,8 @@ def _default_words(field: FieldInfo, value: object) -> str:
             return str(value)
 
 
-def _about(model: type[BaseModel]) -> str:
+def _class_text(model: type[BaseModel]) -> str:
+    """The docstring of a settings class without its indentation."""
     return inspect.cleandoc(model.__doc__ or "")
 
 

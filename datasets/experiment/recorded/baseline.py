@@ -17,7 +17,7 @@ from datasets.experiment.recorded.plan import Bank, Cell, RecordedPlan
 from datasets.experiment.workers import random_generator
 from datasets.inject import Recording
 from pipeline.one_run import monitor_alone
-from pipeline.stages.epochs.clock import Clock, holds, unambiguous
+from pipeline.stages.epochs.clock import Clock, holds_at_rows, unambiguous
 from pipeline.stages.evidence import TrainEvidence
 from pipeline.stages.judge.judge import judge
 from pipeline.stages.judge.judgement import JudgeInput
@@ -113,19 +113,22 @@ class Baseline:
     def have_verdict(self) -> Bools:
         """Epochs at which some monitor had a verdict."""
         states = pl.any_horizontal(pl.col(r"^.*_state$").cast(pl.String).is_in(["pass", "fail"]))
-        return holds(self.epochs, states)
+        return holds_at_rows(self.epochs, states)
 
     def left_out(self, quiet_s: float) -> Ints:
         """Per epoch the reason (number in `LeftOut`) why no fault begins there, -1 where one may."""
         after_gap = np.diff(self.t_ns, prepend=self.t_ns[:1]) > self.clock.limit_s * NS_PER_S
         doubtful = np.zeros(self.t_ns.size, dtype=bool)
         if self.own_error is OwnError.MEASURED:
-            doubtful = ~holds(self.epochs, pl.col("judgement") == Judgement.RIGHT.value)
+            doubtful = ~holds_at_rows(self.epochs, pl.col("judgement") == Judgement.RIGHT.value)
         reason = np.full(self.t_ns.size, -1)
         for why, where in (
             (LeftOut.NOT_RIGHT, doubtful),
             (LeftOut.NO_TVB, ~flags(self.epochs, "tvb") | after_gap),
-            (LeftOut.AMBIGUOUS, ~holds(self.epochs, unambiguous()) & self.epochs["path_m"].is_not_null().to_numpy()),
+            (
+                LeftOut.AMBIGUOUS,
+                ~holds_at_rows(self.epochs, unambiguous()) & self.epochs["path_m"].is_not_null().to_numpy(),
+            ),
             (LeftOut.ALARM, self.are_alarming),
         ):
             reason[where] = _REASONS.index(why)
