@@ -56,6 +56,7 @@ class _OfProject(TyperCommand):
     """Takes what is not given from the project (`--project`, or that of the working directory), and says so."""
 
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
+        """Parse the arguments, with those that are missing taken from the project."""
         given, _, _ = self.make_parser(ctx).parse_args(list(args))
         if not given.get("help") and (given.get("project") or Path("balise.toml").is_file()):
             from pipeline.project.opened import values_from_project
@@ -66,7 +67,7 @@ class _OfProject(TyperCommand):
             second = {"sql": "query", "export": "run"}.get(self.name or "")
             shifted = second in missing and "out" not in missing
             missing = ["out"] if shifted else missing
-            say = None if given.get("quiet") else _say
+            say = None if given.get("quiet") else _print_to_stderr
             ctx.default_map = values_from_project(named, self.name or "", missing, say)
             args = [ctx.default_map["out"], *args] if shifted and ctx.default_map else args
         return super().parse_args(ctx, args)
@@ -78,7 +79,7 @@ def _command(*examples: str, name: str | None = None, of_project: bool = False) 
     return app.command(name, epilog=epilog, cls=_OfProject if of_project else None)
 
 
-def _here(value: Any) -> Any:
+def _local_path(value: Any) -> Any:
     """Refuse addresses where a path is meant: `s3://bucket/run` would become a folder called `s3:`."""
     for path in value if isinstance(value, list | tuple) else [value]:
         if path is not None and re.match(r"[A-Za-z][A-Za-z0-9+.-]+:/", str(path)):
@@ -90,8 +91,8 @@ def _here(value: Any) -> Any:
     return value
 
 
-_place = partial(Argument, callback=_here)
-_file = partial(Option, callback=_here)
+_place = partial(Argument, callback=_local_path)
+_file = partial(Option, callback=_local_path)
 _NEW_RUN = "The run to write: a folder, or a file *.mcap."
 _LOGS = "UBX, SBF, NMEA, NovAtel, RTKLIB .pos, bags, MCAP, CSV with --config, a public recording; archives of these."
 
@@ -178,11 +179,11 @@ def replay(
     from pipeline.results.manifest import settings_files
     from pipeline.show.progress import show_summary, watches
 
-    settings, given = _configuration(config), settings_files(config, vehicle)
+    settings, given = _load_configuration(config), settings_files(config, vehicle)
     if undetected:
         settings = settings.model_copy(update={"undetected": settings.undetected.model_copy(update={"compute": True})})
-    plan = make_plan(runs, site, out, settings, _vehicle(vehicle), route, write_route, given)
-    plan = _calibrated(plan, calibrate, jobs, quiet) if calibrate else plan
+    plan = make_plan(runs, site, out, settings, _load_vehicle(vehicle), route, write_route, given)
+    plan = _calibrate_plan(plan, calibrate, jobs, quiet) if calibrate else plan
     shown = watches(quiet, as_json)
     places = {"site": site, "options": _options(vehicle, config)}
     try:
@@ -190,9 +191,9 @@ def replay(
             plan, jobs=jobs, scheduler=scheduler, force=force, time_limit_s=time_limit, watches=shown
         )
     except Interrupted as interrupted:
-        raise _stopped(interrupted, out, quiet, as_json, places) from None
+        raise _report_interruption(interrupted, out, quiet, as_json, places) from None
     show_summary(summary, out, quiet, as_json, has_pages=False, **places)
-    raise Exit(_status_of(summary, fail_on))
+    raise Exit(_exit_status(summary, fail_on))
 
 
 def _options(vehicle: Path | None, config: Path | None) -> str:
@@ -211,7 +212,9 @@ def _check_named(runs: list[str]) -> None:
             require_match(name)
 
 
-def _stopped(interrupted: Interrupted, out: str, quiet: bool, as_json: bool, places: Mapping[str, str]) -> Exit:
+def _report_interruption(
+    interrupted: Interrupted, out: str, quiet: bool, as_json: bool, places: Mapping[str, str]
+) -> Exit:
     """Say what is done of an interrupted campaign."""
     from pipeline.show.progress import show_summary
 
@@ -223,16 +226,18 @@ def _stopped(interrupted: Interrupted, out: str, quiet: bool, as_json: bool, pla
     return Exit(128 + interrupted.signum)
 
 
-def _status_of(summary: CampaignSummary, fail_on: str | None) -> int:
+def _exit_status(summary: CampaignSummary, fail_on: str | None) -> int:
+    """Exit status of a campaign; `fail_on`: the verdict from which on it counts as not ok."""
     refused = {"unsafe": ["unsafe"], "unproven": ["unsafe", "unproven"]}.get(fail_on or "", [])
     acceptable = summary.all_ok and not any(summary.head.counts()[verdict] for verdict in refused)
     return DEFECT if summary.count_defects else OK if acceptable else RUNS_NOT_OK
 
 
-def _calibrated(plan: Plan, runs: list[str], jobs: int, quiet: bool) -> Plan:
+def _calibrate_plan(plan: Plan, runs: list[str], jobs: int, quiet: bool) -> Plan:
+    """The plan with each run's calibration, its progress shown."""
     from pipeline.campaign.calibrated import calibrate_plan
 
-    with _telling("runs looked at to calibrate", quiet):
+    with _progress_shown("runs looked at to calibrate", quiet):
         return calibrate_plan(plan, runs, jobs)
 
 
@@ -290,21 +295,23 @@ def _spacing(raws: list[Path], balises: str | None) -> tuple[list[Path], str | N
 
 
 def _write_project(wanted: Wanted, folder: Path, accept: bool, force: bool, as_json: bool) -> None:
-    from datasets.recordings import recordings
+    """Draft a project, ask about its corrections, write it, and say what comes next."""
+    from datasets.recordings import public_recordings
     from pipeline.project.init import json_answer, refuse_existing, result_lines, write_project
     from pipeline.project.trial import correction_lines, draft_project
 
-    def asked(run_id: str, found: Sequence[str], corrections: Sequence[StreamCorrection]) -> bool:
+    def accept_corrections(run_id: str, found: Sequence[str], corrections: Sequence[StreamCorrection]) -> bool:
+        """Whether the corrections of a run are accepted: as the options say, else as a person answers."""
         if accept or as_json or not sys.stdin.isatty():
             # Moved positions could hide what the program is to find: only a person takes that.
             return accept and not any(correction.moves for correction in corrections)
-        _say("\n".join([f"\n{run_id} does not fit as recorded:", *found, *correction_lines(corrections)]))
+        _print_to_stderr("\n".join([f"\n{run_id} does not fit as recorded:", *found, *correction_lines(corrections)]))
         return confirm("Accept these corrections?", err=True)
 
     refuse_existing(folder, force)
-    drafted = draft_project(wanted, folder, recordings(), asked)
+    drafted = draft_project(wanted, folder, public_recordings(), accept_corrections)
     file = write_project(drafted, folder)
-    _tell(as_json, json_answer(drafted, file), {"Logs": drafted.logs}, *result_lines(drafted, file))
+    _print_answer(as_json, json_answer(drafted, file), {"Logs": drafted.logs}, *result_lines(drafted, file))
 
 
 @_command("balise run", "balise run --project week12 --jobs 4")
@@ -317,7 +324,7 @@ def run(
     as_json: Json = False,
 ) -> None:
     """Bring a project up to date: convert, site, calibrate, replay, report; only what changed is run again."""
-    from datasets.recordings import recordings
+    from datasets.recordings import public_recordings
     from pipeline.campaign import Interrupted
     from pipeline.project.opened import open_project
     from pipeline.project.run import CallOptions, run_project
@@ -332,11 +339,11 @@ def run(
     places = {"site": opened.place(opened.project.site), "options": named, **opened.message_words}
     pages = None if quiet or as_json else progress_printer("pages")
     at_once = (options.jobs if jobs is None else jobs) or os.cpu_count() or 1
-    call = CallOptions(_steps(quiet, as_json), watches(quiet, as_json), pages, at_once, force, prune)
+    call = CallOptions(_step_printer(quiet, as_json), watches(quiet, as_json), pages, at_once, force, prune)
     try:
-        ended = run_project(opened, recordings(), call)
+        ended = run_project(opened, public_recordings(), call)
     except Interrupted as interrupted:
-        raise _stopped(interrupted, out, quiet, as_json, places) from None
+        raise _report_interruption(interrupted, out, quiet, as_json, places) from None
     if as_json:
         digest, runs = anchor(out)
         manifest = {"sha256": digest, "runs": runs}
@@ -349,16 +356,16 @@ def run(
     if not (quiet or as_json):
         print(f"Report: {ended.page}" + ("" if ended.changed else "\nAll was up to date."))
         print(anchor_words(*anchor(out)))
-    raise Exit(_status_of(ended.summary, options.fail_on) or (RUNS_NOT_OK if ended.unread else OK))
+    raise Exit(_exit_status(ended.summary, options.fail_on) or (RUNS_NOT_OK if ended.unread else OK))
 
 
-def _steps(quiet: bool, as_json: bool) -> Callable[[str, str], None]:
+def _step_printer(quiet: bool, as_json: bool) -> Callable[[str, str], None]:
     """Says what a project's steps do, one line each, on standard error."""
     if quiet:
         return lambda step, text: None
     if as_json:
-        return lambda step, text: _say(json.dumps({"event": "step", "step": step, "text": text}))
-    return lambda step, text: _say(f"{step:<10}{text}")
+        return lambda step, text: _print_to_stderr(json.dumps({"event": "step", "step": step, "text": text}))
+    return lambda step, text: _print_to_stderr(f"{step:<10}{text}")
 
 
 @_command("balise dictionary --table hazards", "balise dictionary --markdown > dictionary.md")
@@ -378,10 +385,10 @@ def dictionary(
         _print_json(columns if table else {"columns": columns, "settings": settings_frame()})
         return
     for name, rows in columns.group_by("group", "table", maintain_order=True):
-        _show(rows.drop("group", "table"), f"{name[1]} ({name[0]})")
+        _print_table(rows.drop("group", "table"), f"{name[1]} ({name[0]})")
         print()
     if table is None:
-        _show(settings_frame(), "Configuration and vehicle")
+        _print_table(settings_frame(), "Configuration and vehicle")
 
 
 @_command("balise demo", "balise demo --out /tmp/demo --seed 7")
@@ -392,16 +399,16 @@ def demo(
     as_json: Json = False,
 ) -> None:
     """Write a synthetic trial with faults, replay it, and compare the hazards found with the faults injected."""
-    from datasets.demo import demo as run_demo
+    from datasets.demo import make_demo as run_demo
 
-    result = run_demo(out, seed, None if quiet else _say)
+    result = run_demo(out, seed, None if quiet else _print_to_stderr)
     if as_json:
         _print_json({"out": out, **result.as_dict()})
     elif not quiet:
         if not result.agrees:
-            _show(result.differing, "What was found differs from what was expected")
+            _print_table(result.differing, "What was found differs from what was expected")
         print(f"{result.head}\nTrial in {out}, tables in {out / 'tables'}, report: {result.page}\n")
-        _show(result.lines)
+        _print_table(result.lines)
         print(result.sentence)
     raise Exit(OK if result.agrees else RUNS_NOT_OK)
 
@@ -417,10 +424,10 @@ def synth(
     from datasets.scenario import load_scenario
     from datasets.trial import write_trial
 
-    paths = write_trial(load_scenario(scenario), out, None if quiet else _say)
+    paths = write_trial(load_scenario(scenario), out, None if quiet else _print_to_stderr)
     if as_json or not quiet:
         made = {"out": out, "site": out / "site", "runs": paths}
-        _tell(as_json, made, {}, f"{len(paths)} runs in {out / 'runs'}, site in {out / 'site'}")
+        _print_answer(as_json, made, {}, f"{len(paths)} runs in {out / 'runs'}, site in {out / 'site'}")
 
 
 @_command(
@@ -447,15 +454,15 @@ def safety(
         from pipeline.show.progress import progress_watch
         from pipeline.studies.safety.assessment import assess
 
-        again = replay_again(logs or [], site, _vehicle(vehicle), jobs, progress_watch)
-        with _telling("runs of several solutions"):
-            found = assess(out, None if config is None else _configuration(config), again)
+        again = replay_again(logs or [], site, _load_vehicle(vehicle), jobs, progress_watch)
+        with _progress_shown("runs of several solutions"):
+            found = assess(out, None if config is None else _load_configuration(config), again)
         show_assessment(found, as_json)
         return
     from pipeline.show.terminal import show_tables
     from pipeline.studies.safety import safety_tables
 
-    tables = safety_tables(_configuration(config).safety)
+    tables = safety_tables(_load_configuration(config).safety)
     _print_json(tables) if as_json else show_tables(tables)
 
 
@@ -478,9 +485,9 @@ def claim(
     from pipeline.studies.claim import assess_claim, load_profile, read_areas, rows_for_reading
 
     wanted = load_profile(profile)
-    ground = _ground(site, _used(out)) if site else None
+    ground = _read_ground(site, _configuration_of_result(out)) if site else None
     areas = read_areas(site, ground) if site and ground else None
-    with _telling("runs"):
+    with _progress_shown("runs"):
         found = assess_claim(out, wanted, ground, areas, front_ahead)
     if csv is not None:
         write_csv(found.table, csv)
@@ -488,7 +495,7 @@ def claim(
         head = {"profile": wanted.name, "version": wanted.version, "sources": list(wanted.sources)}
         title = f"{wanted.name}, version {wanted.version}: {'; '.join(wanted.sources)}"
         answer = {**head, "notes": found.notes, "requirements": found.table}
-        _tell(as_json, answer, {title: rows_for_reading(found)}, "", *found.notes)
+        _print_answer(as_json, answer, {title: rows_for_reading(found)}, "", *found.notes)
 
 
 @_command(
@@ -513,14 +520,14 @@ def inspect(
     kind = kind_at(path)  # what is mistyped is said before anything is loaded
     from pipeline.show.inspection import inspect_path, show_inspection
 
-    settings = _configuration(config)
+    settings = _load_configuration(config)
     if kind is Kind.RAW:
         from pipeline.project.raw import inspect_raw
 
-        ground = None if site is None else _ground(site, settings)
-        tables = inspect_raw(Path(path), settings, ground, _vehicle(vehicle))
+        ground = None if site is None else _read_ground(site, settings)
+        tables = inspect_raw(Path(path), settings, ground, _load_vehicle(vehicle))
     else:
-        tables = inspect_path(path, settings, result, site, _vehicle(vehicle))
+        tables = inspect_path(path, settings, result, site, _load_vehicle(vehicle))
     _print_json(tables) if as_json else show_inspection(tables)
     raise Exit(RUNS_NOT_OK if "Problems" in tables else OK)
 
@@ -538,12 +545,12 @@ def inject(
     """Add a known fault to a recorded run, to measure detection on real noise."""
     from datasets.inject import inject_into, load_faults
 
-    file = _one_of(fault, fault_option, "FAULT", "--fault")
+    file = _either_input(fault, fault_option, "FAULT", "--fault")
     faults = load_faults(file)
-    settings = _configuration(config)
-    inject_into(run, settings, faults, _ground(site, settings) if site else None, out)
+    settings = _load_configuration(config)
+    inject_into(run, settings, faults, _read_ground(site, settings) if site else None, out)
     injected = {"run": run, "fault": file, "out": out, "faults": len(faults)}
-    _tell(as_json, injected, {}, f"{len(faults)} faults injected into {run}: {out}")
+    _print_answer(as_json, injected, {}, f"{len(faults)} faults injected into {run}: {out}")
 
 
 @_command("balise undetected monday.mcap --site line9 --out worst --balise VB07")
@@ -560,13 +567,15 @@ def undetected(
     as_json: Json = False,
 ) -> None:
     """Write the largest fault that no monitor would have noticed at one place of a run, as a file for `inject`."""
-    from datasets.undetected import figures_of, largest_fault, sentence_of, write_fault
+    from datasets.undetected import fault_figures, fault_sentence, largest_fault, write_fault
 
-    settings, train = _configuration(config), _vehicle(vehicle)
-    found = largest_fault(_log(run, settings), _ground(site, settings), train, settings, solution, balise, at_s, behind)
+    settings, train = _load_configuration(config), _load_vehicle(vehicle)
+    found = largest_fault(
+        _read_log(run, settings), _read_ground(site, settings), train, settings, solution, balise, at_s, behind
+    )
     file = write_fault(found, solution if settings.undetected.solutions_at_fault == "one" else None, out)
     check = f"To check it: balise inject {run} {file} --site {site} --out RUN2, and replay RUN2."
-    _tell(as_json, {"fault": file, **figures_of(found)}, {}, sentence_of(found), check)
+    _print_answer(as_json, {"fault": file, **fault_figures(found)}, {}, fault_sentence(found), check)
 
 
 @_command(
@@ -589,9 +598,9 @@ def convert(
     from datasets.recordings import convert_logs
     from pipeline.make.receivers import Purpose
 
-    given = None if config is None else _configuration(config)
+    given = None if config is None else _load_configuration(config)
     done = convert_logs(logs, out, given, Purpose(solution, stream), date, force)
-    _tell(as_json, done.as_dict(), {}, *done.lines())
+    _print_answer(as_json, done.as_dict(), {}, *done.lines())
 
 
 @_command(
@@ -633,14 +642,14 @@ def make_a_site(
     from schemas.enums import TravelAlong
 
     wish = site_request(surveys, balises, epsg, join, flat, TravelAlong(direction), id_field, sigma)
-    site = make_site(wish, _vehicle(vehicle), _configuration(config))
+    site = make_site(wish, _load_vehicle(vehicle), _load_configuration(config))
     write_site(site, site_page(out.resolve().name, site), out, force)
     elements, findings = elements_table(site), findings_table(site.findings)
     made = {"out": out, "page": out / "site.html", "elements": elements, "findings": findings, "balises": site.balises}
     count = 0 if site.balises is None else site.balises.height
     size = f"\n{elements.height} net elements, {elements['length_m'].sum() / 1000:.2f} km, {count} balises in {out}."
     look = f"Look at {out / 'site.html'} before you replay on it."
-    _tell(as_json, made, {"Elements": elements.head(25), "Findings": findings}, size, look)
+    _print_answer(as_json, made, {"Elements": elements.head(25), "Findings": findings}, size, look)
 
 
 @_command("balise calibrate good/*.mcap --site line9 --out train7.toml")
@@ -660,11 +669,11 @@ def calibrate(
     from pipeline.studies.calibration.calibrate import calibrate as measure
     from schemas.config import to_toml
 
-    settings = _configuration(config)
-    with _telling("runs read"):
-        logs = [_log(address, settings) for address in with_progress(find_runs(runs).values())]
-    with _telling("runs measured"):
-        found = measure(logs, _ground(site, settings), _vehicle(vehicle), settings, solution)
+    settings = _load_configuration(config)
+    with _progress_shown("runs read"):
+        logs = [_read_log(address, settings) for address in with_progress(find_runs(runs).values())]
+    with _progress_shown("runs measured"):
+        found = measure(logs, _read_ground(site, settings), _load_vehicle(vehicle), settings, solution)
     write_bytes(out, to_toml(found.vehicle).encode())
     vehicle_found = found.vehicle.model_dump()
     measured = {"out": out, "vehicle": vehicle_found, "monitors": found.monitors, "alarms": found.alarms}
@@ -676,7 +685,7 @@ def calibrate(
         for run_id, monitors in found.alarms.items()
     ]
     words.append(f"\nFor the configuration:\n\n{found.monitors_toml()}\nVehicle file: {out}")
-    _tell(as_json, {**measured, "runs": found.runs, "sigmas": found.sigmas}, tables, *words)
+    _print_answer(as_json, {**measured, "runs": found.runs, "sigmas": found.sigmas}, tables, *words)
 
 
 @_command(
@@ -709,28 +718,28 @@ def experiment(
 
     if name == "list":
         names = [*EXPERIMENTS, RECORDED]
-        _tell(as_json, {"experiments": names}, {}, *names)
+        _print_answer(as_json, {"experiments": names}, {}, *names)
         return
-    with _telling("pieces of work", quiet):
+    with _progress_shown("pieces of work", quiet):
         if name == RECORDED:
-            from datasets.experiment.recorded.command import recorded_experiment, shown
+            from datasets.experiment.recorded.command import recorded_experiment, tables_for_screen
 
-            settings = _configuration(config)
+            settings = _load_configuration(config)
             made = recorded_experiment(
-                runs or [], site, out, plan, vehicle, settings, seed, repetitions, solution, jobs, _say
+                runs or [], site, out, plan, vehicle, settings, seed, repetitions, solution, jobs, _print_to_stderr
             )
         else:
             wanted = experiment_of(name, on_recordings=bool(runs or site or vehicle or plan))
-            bank = None if config is None else _configuration(config)
+            bank = None if config is None else _load_configuration(config)
             files = wanted(out, repetitions, 1 if seed is None else seed, jobs, bank, noise_of)
     if name != RECORDED:
-        _tell(as_json, {"experiment": name, "out": out, "files": files}, {}, *map(str, files))
+        _print_answer(as_json, {"experiment": name, "out": out, "files": files}, {}, *map(str, files))
         return
     for run_id, error in made.failed.items():
-        _say(f"{run_id} is not used: {error}")
+        _print_to_stderr(f"{run_id} is not used: {error}")
     if as_json or not quiet:
         answer = {"experiment": name, "out": out, "files": made.files}
-        _tell(as_json, answer, shown(made), "", *made.remarks, f"\nBegin with {made.files[0]}")
+        _print_answer(as_json, answer, tables_for_screen(made), "", *made.remarks, f"\nBegin with {made.files[0]}")
     raise Exit(RUNS_NOT_OK if made.failed else OK)
 
 
@@ -766,9 +775,9 @@ def sql(
     answer = run_sql(out, query, allow_files, named_results(compared or []))
     written = write_answer(answer, csv, parquet, xlsx, file, guard)
     for name in written:
-        _say(f"{answer.height} rows in {name}")
+        _print_to_stderr(f"{answer.height} rows in {name}")
     if as_json or not (written or csv):
-        _tell(as_json, answer, {"": answer})
+        _print_answer(as_json, answer, {"": answer})
 
 
 @_command(
@@ -799,17 +808,18 @@ def report(
     from pipeline.results.packs import read_twice_if_moved
     from pipeline.show.report import write_against, write_page, write_report
 
-    ground = _ground(site, _used(out)) if site else None
+    ground = _read_ground(site, _configuration_of_result(out)) if site else None
 
-    def written() -> list[Path]:
+    def write_pages() -> list[Path]:
+        """Write the pages that are asked for."""
         if against is not None:
             return [write_against(out, against)]
         return write_report(out, ground, jobs, most) if run is None else [write_page(out, run, ground, most)]
 
-    with _telling("pages", quiet):
-        pages = read_twice_if_moved(written)
+    with _progress_shown("pages", quiet):
+        pages = read_twice_if_moved(write_pages)
     if as_json or not quiet:
-        _tell(as_json, {"page": pages[0], "files": pages}, {}, f"{len(pages)} files; begin with {pages[0]}")
+        _print_answer(as_json, {"page": pages[0], "files": pages}, {}, f"{len(pages)} files; begin with {pages[0]}")
 
 
 @_command(
@@ -835,13 +845,13 @@ def line(
 
     given, keys = None if points is None else read_points(points), "docs/line.md lists every key."
     decided = settings_from({} if criteria is None else read_toml(criteria), LineCriteria, str(criteria), keys)
-    with _telling("runs"):
-        result = study_line(out, _ground(site, _used(out)), decided, solution, given)
+    with _progress_shown("runs"):
+        result = study_line(out, _read_ground(site, _configuration_of_result(out)), decided, solution, given)
     files = write_line(result, to or out / "line")
     tables = {"pieces": result.pieces, "proposals": result.proposals}
     answer = {"page": files[0], "files": files, **tables, "remarks": list(result.remarks)}
     shown = {"Pieces of track": result.summary, "Proposals": result.proposals}
-    _tell(as_json, answer, shown, "\n".join(result.remarks), f"{len(files)} files; begin with {files[0]}")
+    _print_answer(as_json, answer, shown, "\n".join(result.remarks), f"{len(files)} files; begin with {files[0]}")
 
 
 @_command(
@@ -867,12 +877,12 @@ def export(
     from pipeline.results.packs import read_twice_if_moved
     from pipeline.show.export import export_run
 
-    recorded = _log(log, _configuration(config), True) if log else None
-    ground = _ground(site, _used(out)) if site else None
+    recorded = _read_log(log, _load_configuration(config), True) if log else None
+    ground = _read_ground(site, _configuration_of_result(out)) if site else None
     layout: Literal["ros", "foxglove"] = "ros" if ros else "foxglove"
     files, missing = read_twice_if_moved(lambda: export_run(out, run, to, ground, recorded, layout))
     words = ["Wrote " + " and ".join(map(str, files)), *(f"Without {text}" for text in missing)]
-    _tell(as_json, {"files": files, "missing": missing}, {}, *words)
+    _print_answer(as_json, {"files": files, "missing": missing}, {}, *words)
 
 
 @_command(
@@ -898,13 +908,13 @@ def verify(
     from pipeline.show.progress import progress_watch
 
     found = [verify_manifest(out, expect)] if expect else []
-    with _telling("runs", quiet):
+    with _progress_shown("runs", quiet):
         found.append(compare(out))
     if logs:
-        settings = _configuration(config) if config else None
+        settings = _load_configuration(config) if config else None
         shown = [] if quiet else [progress_watch()]
         found += _from_raw_logs(logs, project)
-        found.append(verify_by_replay(out, logs, site, settings, _vehicle(vehicle), route, jobs, shown))
+        found.append(verify_by_replay(out, logs, site, settings, _load_vehicle(vehicle), route, jobs, shown))
     if as_json:
         compared = [{"compared": v.compared, "not_compared": v.not_compared, "problems": v.table} for v in found]
         digest, runs = anchor(out)
@@ -912,7 +922,7 @@ def verify(
         _print_json({"agrees": not any(one.problems for one in found), "manifest": manifest, "comparisons": compared})
     for one in found if not as_json else []:
         if one.problems or not quiet:
-            _tell(False, None, {"": one.table} if one.problems else {}, one.sentence)
+            _print_answer(False, None, {"": one.table} if one.problems else {}, one.sentence)
     if not (as_json or quiet):
         print(anchor_words(*anchor(out)))
     raise Exit(RUNS_NOT_OK if any(one.problems for one in found) else OK)
@@ -920,7 +930,7 @@ def verify(
 
 def _from_raw_logs(logs: list[str], project: Path | None) -> list[Verification]:
     """In a project: whether the raw logs of these runs give them again."""
-    from datasets.recordings import recordings
+    from datasets.recordings import public_recordings
     from pipeline.campaign import find_runs
     from pipeline.project.opened import project_here
     from pipeline.project.reconvert import verify_conversion
@@ -928,7 +938,7 @@ def _from_raw_logs(logs: list[str], project: Path | None) -> list[Verification]:
     opened = project_here(project)
     if opened is None or not opened.project.convert:
         return []
-    return [verify_conversion(opened, recordings(), find_runs(logs).values())]
+    return [verify_conversion(opened, public_recordings(), find_runs(logs).values())]
 
 
 @_command("balise compact week12", "balise compact s3://trial/week12 --runs-per-file 5000")
@@ -943,11 +953,11 @@ def compact(
     """Merge the tables of many runs into few files. Every command reads both forms, also mixed."""
     from pipeline.campaign import compact as packing
 
-    with _telling("runs", quiet):
+    with _progress_shown("runs", quiet):
         found = packing.undo(out) if undo else packing.compact(out, runs_per_file, jobs)
     left_out = [f"{run} keeps files of its own: {reason}" for run, reason in found.left_out.items()]
     if as_json or not quiet:
-        _tell(as_json, asdict(found), {}, found.sentence, *left_out)
+        _print_answer(as_json, asdict(found), {}, found.sentence, *left_out)
     raise Exit(RUNS_NOT_OK if left_out else OK)
 
 
@@ -975,7 +985,7 @@ def diff(
     from schemas.errors import visible
 
     allowed = rules_of(tolerance or [], ignore or [], rules)
-    with _telling("runs"):
+    with _progress_shown("runs"):
         found = diff_results(out_a, out_b, allowed)
     if as_json:
         _print_json(found.as_dict())
@@ -986,9 +996,9 @@ def diff(
 
 def main() -> None:
     """Entry point of the program: turns whatever happens into one message and an exit status."""
-    sys.stdout, sys.stderr = _unbroken(sys.stdout), _unbroken(sys.stderr)
+    sys.stdout, sys.stderr = _ignore_broken_pipe(sys.stdout), _ignore_broken_pipe(sys.stderr)
     arguments = [argument for argument in sys.argv[1:] if argument != "--debug"]
-    status = _guarded(arguments, debug="--debug" in sys.argv[1:])
+    status = _run_guarded(arguments, debug="--debug" in sys.argv[1:])
     gc.freeze()
     sys.exit(status)
 
@@ -997,13 +1007,15 @@ class _Unbroken(io.FileIO):
     """What is written where nobody reads any more (`| head`) is lost, and changes neither the work nor its status."""
 
     def write(self, data: Any) -> int:
+        """Write what somebody still reads; what nobody does counts as written."""
         try:
             return super().write(data)
         except BrokenPipeError:
             return len(data)
 
 
-def _unbroken(stream: TextIO) -> TextIO:
+def _ignore_broken_pipe(stream: TextIO) -> TextIO:
+    """The stream, which takes what is written where nobody reads it any more."""
     try:
         raw = _Unbroken(stream.fileno(), "w", closefd=False)
     except (OSError, ValueError, AttributeError):  # there is none
@@ -1013,32 +1025,34 @@ def _unbroken(stream: TextIO) -> TextIO:
 
 
 @cache
-def _commands() -> Callable[..., Any]:
+def _command_parser() -> Callable[..., Any]:
     """Made once of all signatures; whoever calls the program many times in one process does not wait for it again."""
     return get_command(app)
 
 
-def _guarded(arguments: list[str], debug: bool) -> int:
+def _run_guarded(arguments: list[str], debug: bool) -> int:
+    """Run a command; every error becomes one message and an exit status."""
     from schemas.errors import BaliseError, InputError
 
     try:
-        _commands()(arguments, prog_name="balise", standalone_mode=True)
+        _command_parser()(arguments, prog_name="balise", standalone_mode=True)
     except SystemExit as ended:
         return ended.code if isinstance(ended.code, int) else USAGE
     except BaliseError as error:
-        _complain(str(error), debug)
+        _print_error(str(error), debug)
         return RUNS_NOT_OK if isinstance(error, InputError) else USAGE
     except KeyboardInterrupt:
-        _complain("interrupted", debug)
+        _print_error("interrupted", debug)
         return 128 + signal.SIGINT
     except BaseException as error:  # panics of libraries are no `Exception`
-        _complain(f"a defect of this program: {type(error).__name__}: {error}", debug)
+        _print_error(f"a defect of this program: {type(error).__name__}: {error}", debug)
         print("Please report it with the output of the same command and --debug.", file=sys.stderr)
         return DEFECT
     return OK
 
 
-def _complain(text: str, debug: bool) -> None:
+def _print_error(text: str, debug: bool) -> None:
+    """Print an error on standard error; with `debug` its traceback before."""
     if debug:
         traceback.print_exc()
     from schemas.errors import visible
@@ -1046,19 +1060,21 @@ def _complain(text: str, debug: bool) -> None:
     print(f"balise: {visible(text)}", file=sys.stderr)
 
 
-def _configuration(file: Path | None) -> Configuration:
+def _load_configuration(file: Path | None) -> Configuration:
+    """The configuration of a file; the default without one."""
     from schemas.project import load_configuration
 
     return load_configuration(file)
 
 
-def _vehicle(file: Path | None) -> Vehicle:
+def _load_vehicle(file: Path | None) -> Vehicle:
+    """The vehicle of a file; the default without one."""
     from schemas.config import Vehicle, load_settings
 
     return load_settings(file, Vehicle)
 
 
-def _one_of(positional: Path | None, option: Path | None, name: str, flag: str) -> Path:
+def _either_input(positional: Path | None, option: Path | None, name: str, flag: str) -> Path:
     """An input that may stand among the arguments or behind its option, once."""
     from schemas.errors import UsageError
 
@@ -1068,32 +1084,35 @@ def _one_of(positional: Path | None, option: Path | None, name: str, flag: str) 
     return positional or option  # type: ignore[return-value]
 
 
-def _log(address: str, settings: Configuration, with_digest: bool = False) -> RunLog:
+def _read_log(address: str, settings: Configuration, with_digest: bool = False) -> RunLog:
+    """The run at an address."""
     from pipeline.read.ingest import read_run
 
     return read_run(address, settings.ingest, with_digest)
 
 
-def _ground(site: str, settings: Configuration) -> Ground:
+def _read_ground(site: str, settings: Configuration) -> Ground:
+    """The site at an address."""
     from pipeline.read.site.read import read_site
 
     return read_site(site, settings.site)
 
 
-def _used(out: str | Path) -> Configuration:
+def _configuration_of_result(out: str | Path) -> Configuration:
     """The configuration that a result was made with."""
     from pipeline.results.store import read_config
 
-    return read_config(out) or _configuration(None)
+    return read_config(out) or _load_configuration(None)
 
 
-def _show(table: pl.DataFrame, title: str = "") -> None:
+def _print_table(table: pl.DataFrame, title: str = "") -> None:
+    """Print a table for people."""
     from pipeline.show.terminal import show_table
 
     show_table(table, title)
 
 
-def _telling(things: str, quiet: bool = False) -> contextlib.AbstractContextManager[None]:
+def _progress_shown(things: str, quiet: bool = False) -> contextlib.AbstractContextManager[None]:
     """Say on standard error how many of how many of these things are done, and how long the others will take."""
     from pipeline.results.workers import watched
     from pipeline.show.terminal import progress_printer
@@ -1101,22 +1120,24 @@ def _telling(things: str, quiet: bool = False) -> contextlib.AbstractContextMana
     return watched(None if quiet else progress_printer(things))
 
 
-def _tell(as_json: bool, value: Any, tables: Mapping[str, pl.DataFrame], *words: str) -> None:
+def _print_answer(as_json: bool, value: Any, tables: Mapping[str, pl.DataFrame], *words: str) -> None:
     """The value as JSON, or for people: tables under their titles, then what they mean."""
     if as_json:
         _print_json(value)
         return
     for title, table in tables.items():
-        _show(table, title)
+        _print_table(table, title)
     if words:
         print("\n".join(words))
 
 
-def _say(text: str) -> None:
+def _print_to_stderr(text: str) -> None:
+    """Print a line on standard error."""
     print(text, file=sys.stderr, flush=True)
 
 
 def _print_json(value: Any) -> None:
+    """Print a value as JSON."""
     from pipeline.show.terminal import to_json
 
     print(to_json(value))

@@ -12,7 +12,7 @@ import numpy as np
 import polars as pl
 import pyproj
 
-from datasets.to_contract import conformed, table_of, virtual_balises
+from datasets.to_contract import conform_stream, table_of_contract, virtual_balises
 from pipeline.read.ingest.timescale import GPS_EPOCH_NS, utc_from_gps
 from pipeline.stages.track.geodesy import point_distances_m, points_of
 from schemas.arrays import NS_PER_S, Floats
@@ -37,26 +37,26 @@ def comma2k19_run(segment: Path, balises_at_m: Sequence[float] = ()) -> tuple[Ru
     NaN is not known; a segment without wheel speeds has no odometer.
     Virtual balises may be put at measures along the track.
     """
-    pose_s, places = _poses(segment)
+    pose_s, places = _known_poses(segment)
     offset_s = _utc_offset_s(segment)
-    gnss = _gnss(segment, offset_s)
+    gnss = _gnss_table(segment, offset_s)
     reference = pl.DataFrame({"t": _stamps(pose_s + offset_s), **places}).with_columns(sigma_m=_POSE_SIGMA_M)
     name = segment.resolve().name
-    site = _site(places, balises_at_m)
+    site = _site_of_poses(places, balises_at_m)
     run = RunLog(
         name,
-        conformed(gnss, "gnss", segment),
-        odometer=_odometer(segment, offset_s),
-        reference=conformed(reference, "reference", segment),
+        conform_stream(gnss, "gnss", segment),
+        odometer=_odometer_table(segment, offset_s),
+        reference=conform_stream(reference, "reference", segment),
     )
     return run, site
 
 
-def _log(segment: Path, name: str, columns: int) -> tuple[Floats, Floats]:
+def _read_log(segment: Path, name: str, columns: int) -> tuple[Floats, Floats]:
     """Times and values of as many columns, without rows of no time."""
     folder = segment / "processed_log" / name
-    t_s = _array(folder / "t", 1)
-    value = _array(folder / "value", 2)
+    t_s = _read_array(folder / "t", 1)
+    value = _read_array(folder / "value", 2)
     if len(value) != len(t_s) or value.shape[1] < columns:
         raise InputError(
             "is not as comma2k19 has it",
@@ -68,7 +68,7 @@ def _log(segment: Path, name: str, columns: int) -> tuple[Floats, Floats]:
     return t_s[timed], value[timed]
 
 
-def _array(path: Path, dimensions: int) -> Floats:
+def _read_array(path: Path, dimensions: int) -> Floats:
     """An array of a segment, of so many dimensions."""
     try:
         values: Floats = np.load(path)
@@ -81,11 +81,11 @@ def _array(path: Path, dimensions: int) -> Floats:
     return values.astype(np.float64, copy=False)
 
 
-def _poses(segment: Path) -> tuple[Floats, dict[str, Floats]]:
+def _known_poses(segment: Path) -> tuple[Floats, dict[str, Floats]]:
     """Times on the device's clock, and positions in WGS 84, of the poses that are known."""
     folder = segment / "global_pose"
-    times_s = _array(folder / "frame_times", 1)
-    places_m = _array(folder / "frame_positions", 2)
+    times_s = _read_array(folder / "frame_times", 1)
+    places_m = _read_array(folder / "frame_positions", 2)
     if places_m.shape[1] != 3 or len(times_s) != len(places_m):
         found = f"frame_times of shape {times_s.shape}, frame_positions of shape {places_m.shape}"
         raise InputError("is not as comma2k19 has it", place=str(folder), found=found)
@@ -101,8 +101,8 @@ def _poses(segment: Path) -> tuple[Floats, dict[str, Floats]]:
 def _utc_offset_s(segment: Path) -> float:
     """What is added to the device's clock: both are known for the first frame that has a GPS time."""
     folder = segment / "global_pose"
-    gps = _array(folder / "frame_gps_times", 2)
-    boot_s = _array(folder / "frame_times", 1)
+    gps = _read_array(folder / "frame_gps_times", 2)
+    boot_s = _read_array(folder / "frame_times", 1)
     if gps.shape[1] != 2:  # week and second
         found = f"shape {gps.shape}"
         raise InputError("is not as comma2k19 has it", place=str(folder / "frame_gps_times"), found=found)
@@ -122,9 +122,9 @@ def _stamps(seconds: Floats) -> pl.Series:
     return pl.Series(np.round(seconds * 1e6).astype(np.int64) * 1000).cast(pl.Datetime("ns", "UTC"))
 
 
-def _gnss(segment: Path, offset_s: float) -> pl.DataFrame:
-    """`value`: latitude, longitude, speed, UTC, altitude, bearing."""
-    t_s, value = _log(segment, "GNSS/live_gnss_ublox", columns=6)
+def _gnss_table(segment: Path, offset_s: float) -> pl.DataFrame:
+    """The stream `gnss`; rows of `value` are latitude, longitude, speed, UTC, altitude, bearing."""
+    t_s, value = _read_log(segment, "GNSS/live_gnss_ublox", columns=6)
     bearing = np.radians(value[:, 5])
     known = np.isfinite(value[:, :2]).all(axis=1)
     return pl.DataFrame(
@@ -140,11 +140,11 @@ def _gnss(segment: Path, offset_s: float) -> pl.DataFrame:
     )
 
 
-def _odometer(segment: Path, offset_s: float) -> pl.DataFrame | None:
+def _odometer_table(segment: Path, offset_s: float) -> pl.DataFrame | None:
     """The mean of the wheels that are known; none where there are no wheel speeds."""
     if not (segment / "processed_log" / "CAN" / "wheel_speed").is_dir():
         return None
-    t_s, wheels_mps = _log(segment, "CAN/wheel_speed", columns=1)
+    t_s, wheels_mps = _read_log(segment, "CAN/wheel_speed", columns=1)
     known = np.isfinite(wheels_mps).any(axis=1)
     if not known.any():
         return None
@@ -152,17 +152,17 @@ def _odometer(segment: Path, offset_s: float) -> pl.DataFrame | None:
     frame = pl.DataFrame({"t": _stamps(t_s[known] + offset_s), "speed_mps": speed}).with_columns(
         origin=pl.lit(Origin.WHEEL.value, pl.Enum(Origin))
     )
-    return conformed(frame, "odometer", segment)
+    return conform_stream(frame, "odometer", segment)
 
 
-def _site(places: dict[str, Floats], balises_at_m: Sequence[float]) -> Site:
+def _site_of_poses(places: dict[str, Floats], balises_at_m: Sequence[float]) -> Site:
     """Poses at least 5 m apart, joined to one net element."""
     kept = _poses_apart(places)
     track = {name: values[kept] for name, values in places.items()}
     measure = np.concatenate(
         ([0.0], np.cumsum(point_distances_m(track["latitude_deg"], track["longitude_deg"], track["height_m"])))
     )
-    table = table_of(Track, netelement_id=_ELEMENT, measure_m=measure, **track, sigma_m=_POSE_SIGMA_M)
+    table = table_of_contract(Track, netelement_id=_ELEMENT, measure_m=measure, **track, sigma_m=_POSE_SIGMA_M)
     balises = [(_ELEMENT, at_m) for at_m in balises_at_m]
     return Site(table, Links.create_empty(), virtual_balises(balises) if balises else None)
 

@@ -36,19 +36,19 @@ class ComparisonRow:
         return self.expected == self.found
 
 
-def compare(spec: RunSpec, run: RunLog, tables: RunTables) -> list[ComparisonRow]:
+def compare_run(spec: RunSpec, run: RunLog, tables: RunTables) -> list[ComparisonRow]:
     """Compare a run's expectations with its tables: verdict, hazards, onset, balises, alarms, scale."""
     if spec.expected is None:
         raise ConfigError("does not say what has to be found", place=f"scenario: run {spec.id}")
     injected = describe_faults(run.faults)
     pairs = [
         ("verdict", spec.expected.verdict.value, word_of(worst_verdict(tables.runs["verdict"].to_list()))),
-        ("status", "ok", _one_of(tables.runs["status"].to_list())),
-        *_hazards(spec.expected, tables.hazards),
-        *_onsets(spec, run, tables.hazards),
-        *_balises(spec.expected, tables.passages),
-        *_alarms(spec.expected, tables.alarms),
-        *_scale(spec.expected, tables.runs),
+        ("status", "ok", _value_or_values(tables.runs["status"].to_list())),
+        *_hazard_pairs(spec.expected, tables.hazards),
+        *_onset_pairs(spec, run, tables.hazards),
+        *_balise_pairs(spec.expected, tables.passages),
+        *_alarm_pairs(spec.expected, tables.alarms),
+        *_scale_pairs(spec.expected, tables.runs),
     ]
     return [ComparisonRow(spec.id, spec.title, injected, *pair) for pair in pairs]
 
@@ -76,14 +76,14 @@ def describe_faults(faults: pl.DataFrame | None) -> str:
 Pair = tuple[str, str, str]
 
 
-def _hazards(expected: ExpectedRun, found: pl.DataFrame) -> list[Pair]:
+def _hazard_pairs(expected: ExpectedRun, found: pl.DataFrame) -> list[Pair]:
     """Hazards expected, and those found."""
     rows = found.sort("hazard_id").to_dicts()
     pairs = [
         (
             f"hazard {i}",
             _hazard_text(expected.hazards[i]) if i < len(expected.hazards) else _NOTHING,
-            _row_text(rows[i], expected.hazards[i] if i < len(expected.hazards) else None)
+            _found_text(rows[i], expected.hazards[i] if i < len(expected.hazards) else None)
             if i < len(rows)
             else _NOTHING,
         )
@@ -93,7 +93,8 @@ def _hazards(expected: ExpectedRun, found: pl.DataFrame) -> list[Pair]:
 
 
 def _hazard_text(hazard: ExpectedHazard) -> str:
-    text = _words(
+    """An expected hazard in words."""
+    text = _hazard_words(
         hazard.hazard.value,
         hazard.failure_mode.value,
         hazard.timing.value,
@@ -106,9 +107,10 @@ def _hazard_text(hazard: ExpectedHazard) -> str:
     return text if hazard.caused_by is None else f"{text}, caused by {hazard.caused_by}"
 
 
-def _row_text(row: dict[str, object], expected: ExpectedHazard | None) -> str:
+def _found_text(row: dict[str, object], expected: ExpectedHazard | None) -> str:
+    """A hazard that was found in words, with the same facts as the expected one."""
     names = ("hazard", "failure_mode", "timing", "balise_ids", "accepted_ids", "detected")
-    text = _words(*(row[name] for name in names))
+    text = _hazard_words(*(row[name] for name in names))
     if expected is not None and expected.before_failure is not None:
         detected = row["t_detected"]
         failure = row["t_failure"]
@@ -117,13 +119,14 @@ def _row_text(row: dict[str, object], expected: ExpectedHazard | None) -> str:
     return text if row["caused_by"] is None else f"{text}, caused by {row['caused_by']}"
 
 
-def _words(hazard: object, mode: object, timing: object, hit: object, accepted: object, detected: object) -> str:
+def _hazard_words(hazard: object, mode: object, timing: object, hit: object, accepted: object, detected: object) -> str:
+    """A hazard in words, by its columns."""
     lists = [" ".join(ids) or "-" if isinstance(ids, list | tuple) else "-" for ids in (hit, accepted)]
     detection = "detected" if detected else "not detected"
     return f"{hazard} {mode} {timing}: {lists[0]}, accepted despite the fault {lists[1]}, {detection}"
 
 
-def _onsets(spec: RunSpec, run: RunLog, found: pl.DataFrame) -> list[Pair]:
+def _onset_pairs(spec: RunSpec, run: RunLog, found: pl.DataFrame) -> list[Pair]:
     """The first hazard begins with the fault, within one epoch."""
     if spec.expected is None or not spec.expected.hazards or run.faults is None or found.is_empty():
         return []
@@ -136,10 +139,10 @@ def _onsets(spec: RunSpec, run: RunLog, found: pl.DataFrame) -> list[Pair]:
     return [("onset", "within one epoch", "within one epoch" if near else f"{late_s:+.3f} s")]
 
 
-def _balises(expected: ExpectedRun, found: pl.DataFrame) -> list[Pair]:
+def _balise_pairs(expected: ExpectedRun, found: pl.DataFrame) -> list[Pair]:
     """The status that all rows of a balise have, and for some balises that there is one row only."""
     statuses = {
-        str(balise): _one_of(rows["status"].to_list())
+        str(balise): _value_or_values(rows["status"].to_list())
         for (balise,), rows in found.group_by(["balise_id"], maintain_order=True)
     }
     balises = sorted({*expected.passages, *statuses})
@@ -148,10 +151,10 @@ def _balises(expected: ExpectedRun, found: pl.DataFrame) -> list[Pair]:
     repeated = sorted(set(many) & set(expected.once))
     if expected.once:
         pairs.append(("one passage each", "yes", "yes" if not repeated else f"no: {' '.join(repeated)}"))
-    return _merged(pairs)
+    return _merge_pairs(pairs)
 
 
-def _merged(pairs: list[Pair]) -> list[Pair]:
+def _merge_pairs(pairs: list[Pair]) -> list[Pair]:
     """Balises that agree in one line per status, the others one by one."""
     lines: dict[str, list[str]] = {}
     rest = []
@@ -163,15 +166,15 @@ def _merged(pairs: list[Pair]) -> list[Pair]:
     return [(" ".join(names), status, status) for status, names in lines.items()] + rest
 
 
-def _alarms(expected: ExpectedRun, found: pl.DataFrame) -> list[Pair]:
+def _alarm_pairs(expected: ExpectedRun, found: pl.DataFrame) -> list[Pair]:
     """Alarms expected, and those found."""
-    pairs = [("alarms", expected.alarms, _one_of(found["verdict"].to_list()))]
+    pairs = [("alarms", expected.alarms, _value_or_values(found["verdict"].to_list()))]
     if expected.suspect is not None:
-        pairs.append(("suspect", expected.suspect, _one_of(found["suspect"].to_list())))
+        pairs.append(("suspect", expected.suspect, _value_or_values(found["suspect"].to_list())))
     return pairs
 
 
-def _scale(expected: ExpectedRun, found: pl.DataFrame) -> list[Pair]:
+def _scale_pairs(expected: ExpectedRun, found: pl.DataFrame) -> list[Pair]:
     """Scale of the odometer expected, and that found."""
     if expected.odometer_scale is None:
         return []
@@ -181,6 +184,6 @@ def _scale(expected: ExpectedRun, found: pl.DataFrame) -> list[Pair]:
     return [("odometer scale", text, text if near else str(scale))]
 
 
-def _one_of(values: list[str]) -> str:
+def _value_or_values(values: list[str]) -> str:
     """The value that all have, or all values that occur."""
     return " ".join(sorted(set(values))) or _NOTHING

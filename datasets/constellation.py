@@ -39,6 +39,7 @@ class Orbit:
 
 
 def _instant_ns(year: int, month: int, day: int) -> int:
+    """Midnight of a day in UTC [ns since 1970]."""
     return int(datetime(year, month, day, tzinfo=UTC).timestamp()) * 1_000_000_000
 
 
@@ -129,7 +130,7 @@ def look_angles(
     slots: Sequence[Orbit], t_ns: Ints, latitude_deg: float, longitude_deg: float, height_m: float = 0.0
 ) -> tuple[Floats, Floats]:
     """Azimuth (clockwise from north, [0, 360)) and elevation [deg], each of shape (times, slots)."""
-    frame = _east_north_up(latitude_deg, longitude_deg)
+    frame = _east_north_up_axes(latitude_deg, longitude_deg)
     place_m = earth_centred_m(*(np.array([value]) for value in (latitude_deg, longitude_deg, height_m)))[0]
     line = satellite_positions(slots, t_ns) - place_m
     east, north, up = np.moveaxis(line @ frame.T, -1, 0)
@@ -137,7 +138,7 @@ def look_angles(
     return np.where(azimuth == 360.0, 0.0, azimuth), np.degrees(np.arctan2(up, np.hypot(east, north)))
 
 
-def visible(
+def visible_satellites(
     slots: Sequence[Orbit],
     t_ns: Ints,
     latitude_deg: float,
@@ -169,7 +170,8 @@ def _sidereal_angle(t_ns: Ints) -> Floats:
     return angle
 
 
-def _east_north_up(latitude_deg: float, longitude_deg: float) -> Floats:
+def _east_north_up_axes(latitude_deg: float, longitude_deg: float) -> Floats:
+    """Rotation from earth-fixed axes to east, north, up; shape (3, 3)."""
     sin_b = np.sin(latitude_deg * _DEG)
     cos_b = np.cos(latitude_deg * _DEG)
     sin_l = np.sin(longitude_deg * _DEG)

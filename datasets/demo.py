@@ -9,7 +9,7 @@ from pathlib import Path
 import polars as pl
 import tomli_w
 
-from datasets.comparison import checks_table, compare
+from datasets.comparison import checks_table, compare_run
 from datasets.scenario import Scenario, load_scenario, with_seed
 from datasets.trial import write_trial
 from pipeline import storage
@@ -63,7 +63,7 @@ class DemoResult:
         of_runs = self.checks.group_by("run_id", maintain_order=True)
         agreement = of_runs.agg(pl.col("injected").first(), pl.col("agrees").sum(), pl.len()).rows()
         rows = [
-            (run_id, _in_short(injected), _verdict(one), _classes(one.hazards), f"{agreeing}/{of}")
+            (run_id, _shorten_faults(injected), _verdict_word(one), _hazard_classes(one.hazards), f"{agreeing}/{of}")
             for (run_id, injected, agreeing, of), one in zip(agreement, self.tables, strict=True)
         ]
         names = ("run_id", "injected", "verdict", "hazards", "checks")
@@ -85,20 +85,22 @@ class DemoResult:
         )
 
 
-def _in_short(injected: str) -> str:
+def _shorten_faults(injected: str) -> str:
     """Faults in words without how long they last."""
     return ", ".join(fault.partition(" for ")[0] for fault in injected.split(", "))
 
 
-def _verdict(tables: RunTables) -> str:
+def _verdict_word(tables: RunTables) -> str:
+    """The worst verdict of a run's solutions, in a word."""
     return word_of(worst_verdict(tables.runs["verdict"].to_list()))
 
 
-def _classes(hazards: pl.DataFrame) -> str:
+def _hazard_classes(hazards: pl.DataFrame) -> str:
+    """Classes of the hazards of a run."""
     return " ".join(hazards["hazard"].cast(pl.String).unique(maintain_order=True)) or "none"
 
 
-def demo(out: Path, seed: int | None = None, progress: Progress | None = None, jobs: int = 1) -> DemoResult:
+def make_demo(out: Path, seed: int | None = None, progress: Progress | None = None, jobs: int = 1) -> DemoResult:
     """Write the trial under `out` as a project, replay it to `tables/`, compare, and write pages.
 
     Another `seed` than the scenario's own draws other errors; what has to be found is the same.
@@ -110,7 +112,7 @@ def demo(out: Path, seed: int | None = None, progress: Progress | None = None, j
     tables = tuple(read_run(out / "tables", spec.id) for spec in scenario.runs)
     config = Configuration()
     logs = (read_log(path, config.ingest) for path in paths)
-    checks = [check for case in zip(scenario.runs, logs, tables, strict=True) for check in compare(*case)]
+    checks = [check for case in zip(scenario.runs, logs, tables, strict=True) for check in compare_run(*case)]
     site = read_site(out / "site", config.site)
     return DemoResult(scenario, checks_table(checks), tables, write_report(out / "tables", site, jobs)[0])
 

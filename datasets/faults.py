@@ -23,6 +23,8 @@ NS_PER_S = 1_000_000_000
 
 
 class FaultKind(StrEnum):
+    """Kinds of faults that can be injected."""
+
     STEP = "step"
     BIAS = "bias"
     RAMP = "ramp"
@@ -160,17 +162,17 @@ def position_effect(faults: Sequence[FaultSpec], t_s: Floats, rng: np.random.Gen
     lost = np.zeros(t_s.size, dtype=np.bool_)
     for fault in faults:
         if fault.target in offsets:
-            offsets[fault.target] += offset_m(fault, t_s, rng)
+            offsets[fault.target] += fault_offset_m(fault, t_s, rng)
         elif fault.target == "position" and fault.kind is FaultKind.LATENCY:
-            latency += np.where(active(fault, t_s), fault.latency_s or 0.0, 0.0)
+            latency += np.where(is_active(fault, t_s), fault.latency_s or 0.0, 0.0)
         elif fault.target == "position":
-            lost |= active(fault, t_s)
+            lost |= is_active(fault, t_s)
     return PositionEffect(**{f"{axis}_m": value for axis, value in offsets.items()}, latency_s=latency, lost=lost)
 
 
-def offset_m(fault: FaultSpec, t_s: Floats, rng: np.random.Generator) -> Floats:
+def fault_offset_m(fault: FaultSpec, t_s: Floats, rng: np.random.Generator) -> Floats:
     """A step, bias, ramp or noise burst over time [m]."""
-    now = active(fault, t_s)
+    now = is_active(fault, t_s)
     if fault.kind is FaultKind.RAMP:
         limit = np.inf if fault.duration_s is None else fault.duration_s
         grown = (fault.rate_mps or 0.0) * np.clip(t_s - fault.begins_s(), 0.0, limit)
@@ -198,7 +200,7 @@ def read_profile(path: str) -> tuple[Floats, Floats]:
     return values[:, 0], values[:, 1]
 
 
-def active(fault: FaultSpec, t_s: Floats) -> Bools:
+def is_active(fault: FaultSpec, t_s: Floats) -> Bools:
     """Whether a fault is active, from its start on, its end excluded."""
     t_ns = np.round(t_s * NS_PER_S)
     begin_ns = round(fault.begins_s() * NS_PER_S)
@@ -221,7 +223,7 @@ def odometer_increments(faults: Sequence[FaultSpec], t_s: Floats, increments_m: 
         end_s = np.inf if fault.duration_s is None else fault.begins_s() + fault.duration_s
         within_s = np.maximum(np.minimum(t_s, end_s) - np.maximum(begins_s, fault.begins_s()), 0.0)
         share = np.divide(within_s, step_s, out=np.zeros_like(step_s), where=step_s > 0.0)
-        result = result * (1.0 - share) + _turned(fault, result * share, within_s)
+        result = result * (1.0 - share) + _faulty_movement(fault, result * share, within_s)
     return result
 
 
@@ -230,11 +232,11 @@ def odometer_speeds(faults: Sequence[FaultSpec], t_s: Floats, speed_mps: Floats)
     result = speed_mps.copy()
     for fault in faults:
         if fault.hits_odometer and fault.kind in _ON_ODOMETER:
-            result = np.where(active(fault, t_s), _turned(fault, result, np.ones(t_s.size)), result)
+            result = np.where(is_active(fault, t_s), _faulty_movement(fault, result, np.ones(t_s.size)), result)
     return result
 
 
-def _turned(fault: FaultSpec, moved: Floats, time_s: Floats) -> Floats:
+def _faulty_movement(fault: FaultSpec, moved: Floats, time_s: Floats) -> Floats:
     """What the odometer counts where it should count `moved` within these times."""
     sense = np.where(moved < 0.0, -1.0, 1.0)
     change = (fault.rate_mps or 0.0) * time_s
@@ -255,7 +257,7 @@ def faults_table(faults: Sequence[FaultSpec], first_ns: int, last_ns: int) -> pl
         begin = first_ns + round(fault.begins_s() * NS_PER_S)
         stays = fault.duration_s is None or (fault.kind is FaultKind.RAMP and not fault.returns)
         end = last_ns if stays else min(begin + round((fault.duration_s or 0.0) * NS_PER_S), last_ns)
-        size = _size(fault, (last_ns - begin) / NS_PER_S)
+        size = _final_size(fault, (last_ns - begin) / NS_PER_S)
         rows.append((begin, end, fault.kind.value, fault.target, size, fault.rate_mps))
     rows.sort(key=lambda row: (row[0], row[3], row[2]))
     table = pl.DataFrame(rows, schema=_FAULTS, orient="row")
@@ -273,7 +275,7 @@ _FAULTS = {
 }
 
 
-def _size(fault: FaultSpec, to_end_s: float) -> float | None:
+def _final_size(fault: FaultSpec, to_end_s: float) -> float | None:
     """The quantity of the kind; of a ramp, slip or slide what it has grown to at its end [m]."""
     if fault.rate_mps is not None:
         return fault.rate_mps * (to_end_s if fault.duration_s is None else min(fault.duration_s, to_end_s))

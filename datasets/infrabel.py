@@ -13,7 +13,7 @@ from pathlib import Path
 
 import polars as pl
 
-from datasets.to_contract import conformed, virtual_balises
+from datasets.to_contract import conform_stream, virtual_balises
 from pipeline.make.receivers import Converted
 from pipeline.read.ingest.conform import rows_text
 from pipeline.read.ingest.csv_text import CUT_ROW, read_log_table
@@ -64,11 +64,11 @@ def infrabel_recording(log: Path) -> Converted:
         longitude_deg=pl.col("longitude").cast(pl.Float64, strict=False),
         fix=fix,
     )
-    _refuse_unreadable(table.select("timestamp", "latitude", "longitude"), gnss.select(pl.nth(0, 1, 2)), log)
-    return Converted(RunLog(log.stem, conformed(gnss, "gnss", log)), {CUT_ROW: cut} if cut else {})
+    _require_numbers(table.select("timestamp", "latitude", "longitude"), gnss.select(pl.nth(0, 1, 2)), log)
+    return Converted(RunLog(log.stem, conform_stream(gnss, "gnss", log)), {CUT_ROW: cut} if cut else {})
 
 
-def _refuse_unreadable(texts: pl.DataFrame, values: pl.DataFrame, log: Path) -> None:
+def _require_numbers(texts: pl.DataFrame, values: pl.DataFrame, log: Path) -> None:
     """Refuse texts that are no number."""
     for text, value in zip(texts, values, strict=True):
         wrong = value.is_null() & text.is_not_null() & (text != "")

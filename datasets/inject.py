@@ -14,14 +14,14 @@ from datasets.faults import (
     NS_PER_S,
     FaultKind,
     FaultSpec,
-    active,
+    fault_offset_m,
     faults_table,
+    is_active,
     odometer_increments,
     odometer_speeds,
-    offset_m,
 )
 from datasets.inject_ranges import inject_ranges
-from datasets.line import RailPlaces, shifted
+from datasets.line import RailPlaces, shift_places
 from datasets.run_path import DrivenPath, displacement_m, driven_path
 from datasets.trial import write_run_as
 from pipeline.read.ingest import read_run
@@ -107,11 +107,11 @@ def inject(run: RunLog, fault: FaultSpec, site: Site | None = None, whole: Recor
         raise ConfigError("names a solution that the run does not have", place=place, expected=known)
     rng = np.random.default_rng(zlib.crc32(json.dumps([run.run_id, fault.model_dump(mode="json")]).encode()))
     if fault.hits_odometer:
-        changed = run.with_streams(odometer=_odometer(run, fault, first_ns))
+        changed = run.with_streams(odometer=_odometer_with_fault(run, fault, first_ns))
     elif fault.hits_ranges:
         changed = inject_ranges(run, fault, first_ns, rng)
     else:
-        changed = run.with_streams(gnss=_positions(run, fault, whole, rng))
+        changed = run.with_streams(gnss=_positions_with_fault(run, fault, whole, rng))
     faults = faults_table([fault], first_ns, last_ns)
     if run.faults is not None:
         faults = pl.concat([run.faults, faults]).sort("t_start", maintain_order=True)
@@ -126,36 +126,37 @@ def _span_ns(run: RunLog) -> tuple[int, int]:
     return int(t_ns.min()), int(t_ns.max())  # type: ignore[arg-type]
 
 
-def _seconds(frame: pl.DataFrame, first_ns: int) -> Floats:
+def _seconds_since(frame: pl.DataFrame, first_ns: int) -> Floats:
+    """Times of a stream since an instant [s]."""
     seconds: Floats = (frame["t"].to_physical().to_numpy() - first_ns) / NS_PER_S
     return seconds
 
 
-def _positions(run: RunLog, fault: FaultSpec, whole: Recording, rng: np.random.Generator) -> pl.DataFrame:
+def _positions_with_fault(run: RunLog, fault: FaultSpec, whole: Recording, rng: np.random.Generator) -> pl.DataFrame:
     """Positions of a run with a fault."""
     parts = []
     for solution in run.gnss["solution"].unique(maintain_order=True):
         part = run.gnss.with_row_index("row").filter(pl.col("solution") == solution)
         if fault.solution in (None, solution):
-            part = _position_fault(fault, part, solution, whole, rng)
+            part = _solution_with_fault(fault, part, solution, whole, rng)
         parts.append(part)
     return pl.concat(parts).sort("row").drop("row")
 
 
-def _position_fault(
+def _solution_with_fault(
     fault: FaultSpec, part: pl.DataFrame, solution: str, whole: Recording, rng: np.random.Generator
 ) -> pl.DataFrame:
     """Positions of one solution with a fault."""
-    t_s = _seconds(part, whole.first_ns)
+    t_s = _seconds_since(part, whole.first_ns)
     if fault.kind is FaultKind.OUTAGE:
-        return part.filter(pl.Series(~active(fault, t_s)))
+        return part.filter(pl.Series(~is_active(fault, t_s)))
     if fault.kind is FaultKind.LATENCY:
-        return _late(part, fault, t_s)
-    size = offset_m(fault, t_s, rng)
-    return _moved(part, _vectors(fault.target, solution, part, size, whole))
+        return _delay_positions(part, fault, t_s)
+    size = fault_offset_m(fault, t_s, rng)
+    return _move_positions(part, _displacements_m(fault.target, solution, part, size, whole))
 
 
-def _vectors(axis: str, solution: str, part: pl.DataFrame, size_m: Floats, whole: Recording) -> Floats:
+def _displacements_m(axis: str, solution: str, part: pl.DataFrame, size_m: Floats, whole: Recording) -> Floats:
     """Displacement east, north, up of each epoch [m]."""
     zeros = np.zeros(size_m.size)
     if axis in ("along", "cross"):
@@ -165,20 +166,20 @@ def _vectors(axis: str, solution: str, part: pl.DataFrame, size_m: Floats, whole
     return np.column_stack([size_m if axis == name else zeros for name in ("east", "north", "up")])
 
 
-def _moved(part: pl.DataFrame, vectors_m: Floats) -> pl.DataFrame:
+def _move_positions(part: pl.DataFrame, vectors_m: Floats) -> pl.DataFrame:
     """Positions moved; a height that is not known stays so."""
     latitude, longitude, height = (part[name].to_numpy().astype(np.float64) for name in _PLACE)
     nothing = np.zeros(0)
-    places = shifted(RailPlaces(latitude, longitude, np.nan_to_num(height), nothing, nothing), *vectors_m.T)
+    places = shift_places(RailPlaces(latitude, longitude, np.nan_to_num(height), nothing, nothing), *vectors_m.T)
     moved = (places.latitude_deg, places.longitude_deg, height + vectors_m[:, 2])
     return part.with_columns(
         pl.Series(name, values, nan_to_null=True) for name, values in zip(_PLACE, moved, strict=True)
     )
 
 
-def _late(part: pl.DataFrame, fault: FaultSpec, t_s: Floats) -> pl.DataFrame:
+def _delay_positions(part: pl.DataFrame, fault: FaultSpec, t_s: Floats) -> pl.DataFrame:
     """Positions and velocities of `latency_s` ago under the stamps of now; where none is recorded the epoch is lost."""
-    now = active(fault, t_s)
+    now = is_active(fault, t_s)
     known = part.filter(pl.col("latitude_deg").is_not_null()).sort("t", maintain_order=True)
     known_s = t_s[np.isin(part["row"].to_numpy(), known["row"].to_numpy())]
     known_s = np.sort(known_s, kind="stable")
@@ -196,18 +197,19 @@ def _late(part: pl.DataFrame, fault: FaultSpec, t_s: Floats) -> pl.DataFrame:
     return part.with_columns(series).filter(pl.Series(~lost))
 
 
-def _odometer(run: RunLog, fault: FaultSpec, first_ns: int) -> pl.DataFrame:
+def _odometer_with_fault(run: RunLog, fault: FaultSpec, first_ns: int) -> pl.DataFrame:
+    """The odometer with the fault in each of its sensors; raises `InputError` without one."""
     if run.odometer is None:
         raise InputError("has no odometer for this fault", place=run.run_id, expected="an odometer stream")
     sensors = run.odometer.sort("t", maintain_order=True).partition_by("sensor", maintain_order=True)
-    return pl.concat([_faulty_sensor(sensor, fault, first_ns) for sensor in sensors])
+    return pl.concat([_sensor_with_fault(sensor, fault, first_ns) for sensor in sensors])
 
 
-def _faulty_sensor(odometer: pl.DataFrame, fault: FaultSpec, first_ns: int) -> pl.DataFrame:
+def _sensor_with_fault(odometer: pl.DataFrame, fault: FaultSpec, first_ns: int) -> pl.DataFrame:
     """One sensor of the odometer with a fault."""
-    t_s = _seconds(odometer, first_ns)
+    t_s = _seconds_since(odometer, first_ns)
     if fault.kind is FaultKind.OUTAGE:
-        return odometer.filter(pl.Series(~active(fault, t_s)))
+        return odometer.filter(pl.Series(~is_active(fault, t_s)))
     distance = odometer["distance_m"].to_numpy().copy()
     speed = odometer["speed_mps"].to_numpy().copy()
     rows = np.flatnonzero(np.isfinite(distance))

@@ -10,9 +10,9 @@ import numpy as np
 import numpy.typing as npt
 import polars as pl
 
-from datasets.faults import NS_PER_S, FaultKind, FaultSpec, active, in_sector, offset_m
-from datasets.line import RailPlaces, shifted
-from datasets.solution import PositionSolution, protection_levels, solve
+from datasets.faults import NS_PER_S, FaultKind, FaultSpec, fault_offset_m, in_sector, is_active
+from datasets.line import RailPlaces, shift_places
+from datasets.solution import PositionSolution, protection_levels, solve_positions
 from schemas.arrays import Bools, Floats
 from schemas.errors import InputError
 from schemas.frozen import frozen
@@ -37,7 +37,7 @@ class _RecordedRanges:
     def solved(self, range_error_m: Floats, usable: Bools) -> PositionSolution:
         """The position errors that errors of ranges make, (epochs, satellites)."""
         angles = (np.nan_to_num(self.azimuth_deg), np.nan_to_num(self.elevation_deg))
-        return solve(self.svs, *angles, self.sigma_m, range_error_m, usable, self.recorded)
+        return solve_positions(self.svs, *angles, self.sigma_m, range_error_m, usable, self.recorded)
 
 
 def inject_ranges(run: RunLog, fault: FaultSpec, first_ns: int, rng: np.random.Generator) -> RunLog:
@@ -51,7 +51,7 @@ def inject_ranges(run: RunLog, fault: FaultSpec, first_ns: int, rng: np.random.G
         fixes = run.gnss.with_row_index("row").filter(pl.col("solution") == solution)
         rows = run.satellites.with_row_index("row").filter(pl.col("solution") == solution)
         if fault.solution in (None, solution) and rows.height:
-            fixes, rows, hit = _in_solution(fixes, rows, fault, first_ns, rng)
+            fixes, rows, hit = _solution_with_fault(fixes, rows, fault, first_ns, rng)
             hit_any |= hit
         gnss.append(fixes)
         satellites.append(rows)
@@ -65,42 +65,44 @@ def inject_ranges(run: RunLog, fault: FaultSpec, first_ns: int, rng: np.random.G
     )
 
 
-def _in_solution(
+def _solution_with_fault(
     fixes: pl.DataFrame, rows: pl.DataFrame, fault: FaultSpec, first_ns: int, rng: np.random.Generator
 ) -> tuple[pl.DataFrame, pl.DataFrame, bool]:
     """Positions and residuals of one solution with a fault of satellites."""
-    ranges = _arrays(rows)
+    ranges = _recorded_arrays(rows)
     t_s = (ranges.t_ns - first_ns) / NS_PER_S
     hit = in_sector(fault, ranges.svs, ranges.azimuth_deg, ranges.elevation_deg) & ranges.recorded
-    profile = _profile(fault, t_s, hit.shape, rng)
-    lost = hit & active(fault, t_s)[:, None] & (fault.kind is FaultKind.OUTAGE)
+    profile = _range_errors_m(fault, t_s, hit.shape, rng)
+    lost = hit & is_active(fault, t_s)[:, None] & (fault.kind is FaultKind.OUTAGE)
     error = np.where(hit, profile, 0.0)
     touched = (error != 0.0).any(axis=1) | lost.any(axis=1)
     residual = np.nan_to_num(ranges.residual_m)
     before = ranges.solved(residual, ranges.used)
     after = ranges.solved(residual + error, ranges.used & ~lost)
-    _refuse_unsolved(fixes, ranges, touched & ~before.solved)
+    _require_solved(fixes, ranges, touched & ~before.solved)
     new_residual = np.where(touched[:, None], after.residual_m + (residual - before.residual_m), ranges.residual_m)
     new_residual = np.where(np.isnan(ranges.residual_m), np.nan, new_residual)
-    moved = _moved(fixes, ranges, before, after, touched)
-    return moved, _rows_with(rows, ranges, new_residual, lost), bool(touched.any())
+    moved = _move_positions(fixes, ranges, before, after, touched)
+    return moved, _satellite_rows(rows, ranges, new_residual, lost), bool(touched.any())
 
 
-def _profile(fault: FaultSpec, t_s: Floats, shape: tuple[int, ...], rng: np.random.Generator) -> Floats:
+def _range_errors_m(fault: FaultSpec, t_s: Floats, shape: tuple[int, ...], rng: np.random.Generator) -> Floats:
+    """Range errors that a fault makes [m], broadcast to (epochs, satellites)."""
     if fault.kind is FaultKind.OUTAGE:
         return np.zeros(shape)
     if fault.kind is FaultKind.NOISE:
-        return np.where(active(fault, t_s)[:, None], (fault.sigma_m or 0.0) * rng.standard_normal(shape), 0.0)
-    return np.broadcast_to(offset_m(fault, t_s, rng)[:, None], shape)
+        return np.where(is_active(fault, t_s)[:, None], (fault.sigma_m or 0.0) * rng.standard_normal(shape), 0.0)
+    return np.broadcast_to(fault_offset_m(fault, t_s, rng)[:, None], shape)
 
 
-def _arrays(rows: pl.DataFrame) -> _RecordedRanges:
+def _recorded_arrays(rows: pl.DataFrame) -> _RecordedRanges:
     """Residuals by epoch and satellite."""
     t_ns, epoch = np.unique(rows["t"].to_physical().to_numpy(), return_inverse=True)
     svs = sorted(rows["sv"].unique().to_list())
     satellite = np.searchsorted(svs, rows["sv"].to_list())
 
     def matrix(name: str, empty: float) -> Floats:
+        """A column as (epochs, satellites), with `empty` where nothing is recorded."""
         values = np.full((t_ns.size, len(svs)), empty)
         values[epoch, satellite] = rows[name].to_numpy().astype(np.float64)
         return values
@@ -115,7 +117,7 @@ def _arrays(rows: pl.DataFrame) -> _RecordedRanges:
     return _RecordedRanges(t_ns, svs, *angles, sigma, matrix("residual_m", np.nan), recorded, used)
 
 
-def _refuse_unsolved(fixes: pl.DataFrame, ranges: _RecordedRanges, unsolved: Bools) -> None:
+def _require_solved(fixes: pl.DataFrame, ranges: _RecordedRanges, unsolved: Bools) -> None:
     """A position whose recorded satellites are too few cannot be moved by one of them."""
     stamps = ranges.t_ns[unsolved]
     known = fixes.filter(pl.col("latitude_deg").is_not_null())["t"].to_physical().to_numpy()
@@ -129,7 +131,7 @@ def _refuse_unsolved(fixes: pl.DataFrame, ranges: _RecordedRanges, unsolved: Boo
         )
 
 
-def _moved(
+def _move_positions(
     fixes: pl.DataFrame, ranges: _RecordedRanges, before: PositionSolution, after: PositionSolution, touched: Bools
 ) -> pl.DataFrame:
     """Positions, covariances, protection levels and satellites used of touched epochs; those without solution go."""
@@ -143,20 +145,20 @@ def _moved(
         fixes[name].to_numpy().astype(np.float64) for name in ("latitude_deg", "longitude_deg", "height_m")
     )
     nothing = np.zeros(0)
-    places = shifted(RailPlaces(latitude, longitude, np.nan_to_num(height), nothing, nothing), *step.T)
+    places = shift_places(RailPlaces(latitude, longitude, np.nan_to_num(height), nothing, nothing), *step.T)
     columns = {
         "latitude_deg": places.latitude_deg,
         "longitude_deg": places.longitude_deg,
         "height_m": height + step[:, 2],
         **{f"cov_{n}_m2": fixes[f"cov_{n}_m2"].to_numpy() + wider[:, i, j] for n, i, j in _COVARIANCE},
-        **_levels(fixes, before, after, place, here),
+        **_protection_levels(fixes, before, after, place, here),
     }
     series = [pl.Series(name, values, nan_to_null=True) for name, values in columns.items()]
     counted = (pl.col("satellites") - pl.Series(fewer)).clip(lower_bound=0)
     return fixes.with_columns(*series, satellites=counted).filter(pl.Series(~(here & ~after.solved[place])))
 
 
-def _levels(
+def _protection_levels(
     fixes: pl.DataFrame, before: PositionSolution, after: PositionSolution, place: npt.NDArray[np.int64], here: Bools
 ) -> dict[str, Floats]:
     """Recorded protection levels grow as those of the geometry do."""
@@ -170,7 +172,7 @@ def _levels(
     }
 
 
-def _rows_with(rows: pl.DataFrame, ranges: _RecordedRanges, residual_m: Floats, lost: Bools) -> pl.DataFrame:
+def _satellite_rows(rows: pl.DataFrame, ranges: _RecordedRanges, residual_m: Floats, lost: Bools) -> pl.DataFrame:
     """Rows of satellites with new residuals, without those lost."""
     epoch = np.searchsorted(ranges.t_ns, rows["t"].to_physical().to_numpy())
     satellite = np.searchsorted(ranges.svs, rows["sv"].to_list())

@@ -46,7 +46,7 @@ class LineAxis:
         """Length of the line [m]."""
         return float(self.chainage_m[-1])
 
-    def at(self, s_m: Floats) -> RailPlaces:
+    def places_at(self, s_m: Floats) -> RailPlaces:
         """Places at chainages; a chainage beyond the line is an error in the scenario."""
         if s_m.size and (s_m.min() < 0.0 or s_m.max() > self.length_m):
             raise ConfigError(
@@ -72,20 +72,20 @@ def build_line(spec: LineSpec) -> LineAxis:
     total_m = sum(element.length_m for element in spec.elements)
     chainage = np.linspace(0.0, total_m, int(np.ceil(total_m / _STEP_M)) + 1)
     step = chainage[1]
-    curvature, grade = _profile(spec, chainage, step)
-    heading = np.radians(spec.heading_deg) - _integral(curvature, step)
+    curvature, grade = _curvature_and_grade(spec, chainage, step)
+    heading = np.radians(spec.heading_deg) - _running_integral(curvature, step)
     slope_angle = np.arctan(grade)
-    samples = _walk(spec, heading, slope_angle, step)
+    samples = _integrate_positions(spec, heading, slope_angle, step)
     return LineAxis(spec, chainage, samples)
 
 
 def offset_places(places: RailPlaces, left_m: Floats | float) -> RailPlaces:
     """The same places moved to the left of growing chainage."""
     heading = np.radians(places.heading_deg)
-    return shifted(places, -np.cos(heading) * left_m, np.sin(heading) * left_m, np.zeros_like(heading))
+    return shift_places(places, -np.cos(heading) * left_m, np.sin(heading) * left_m, np.zeros_like(heading))
 
 
-def shifted(places: RailPlaces, east_m: Floats, north_m: Floats, up_m: Floats) -> RailPlaces:
+def shift_places(places: RailPlaces, east_m: Floats, north_m: Floats, up_m: Floats) -> RailPlaces:
     """Places moved by a vector of the local horizon, small against the radius of the Earth."""
     latitude_deg, longitude_deg = moved_deg(places.latitude_deg, places.longitude_deg, places.height_m, east_m, north_m)
     return RailPlaces(latitude_deg, longitude_deg, places.height_m + up_m, places.heading_deg, places.slope)
@@ -95,13 +95,15 @@ def track_table(line: LineAxis, rng: np.random.Generator) -> pl.DataFrame:
     """The survey of all net elements, with the errors that the scenario gives it (constant in place)."""
     parts = []
     for element, begin_m in zip(line.spec.elements, _element_starts(line.spec), strict=True):
-        parts.append(_surveyed(line, element.id, begin_m, element.length_m, 0.0, element.reversed))
+        parts.append(_surveyed_element(line, element.id, begin_m, element.length_m, 0.0, element.reversed))
     for parallel in line.spec.parallels:
-        parts.append(_surveyed(line, parallel.id, parallel.from_m, _length(parallel), parallel.left_m, False))
+        parts.append(
+            _surveyed_element(line, parallel.id, parallel.from_m, _parallel_length_m(parallel), parallel.left_m, False)
+        )
     survey = line.spec.survey
     table = pl.concat(parts)
     noise = _survey_noise(table, survey, rng)
-    moved = shifted(
+    moved = shift_places(
         RailPlaces(**{name: table[name].to_numpy() for name in _PLACE}, heading_deg=np.zeros(0), slope=np.zeros(0)),
         survey.bias_east_m + noise[0],
         survey.bias_north_m + noise[1],
@@ -152,11 +154,13 @@ def _element_starts(spec: LineSpec) -> list[float]:
     return [0.0, *accumulate(element.length_m for element in spec.elements[:-1])]
 
 
-def _length(parallel: ParallelSpec) -> float:
+def _parallel_length_m(parallel: ParallelSpec) -> float:
+    """Length of a parallel track [m]."""
     return parallel.to_m - parallel.from_m
 
 
-def _profile(spec: LineSpec, chainage: Floats, step: float) -> tuple[Floats, Floats]:
+def _curvature_and_grade(spec: LineSpec, chainage: Floats, step: float) -> tuple[Floats, Floats]:
+    """Curvature [1/m] and grade at chainages, smoothed over the transitions."""
     ends = np.cumsum([section.length_m for section in spec.sections])
     index = np.searchsorted(ends, chainage % ends[-1], side="right").clip(max=len(spec.sections) - 1)
     curvature = np.array([1.0 / s.radius_m if s.radius_m else 0.0 for s in spec.sections])[index]
@@ -165,17 +169,17 @@ def _profile(spec: LineSpec, chainage: Floats, step: float) -> tuple[Floats, Flo
     return uniform_filter1d(curvature, samples, mode="nearest"), uniform_filter1d(grade, samples, mode="nearest")
 
 
-def _integral(values: Floats, step: float) -> Floats:
+def _running_integral(values: Floats, step: float) -> Floats:
     """Running trapezoidal integral, 0 at the first sample."""
     return np.concatenate(([0.0], np.cumsum(0.5 * (values[1:] + values[:-1])) * step))
 
 
-def _walk(spec: LineSpec, heading: Floats, slope_angle: Floats, step: float) -> RailPlaces:
+def _integrate_positions(spec: LineSpec, heading: Floats, slope_angle: Floats, step: float) -> RailPlaces:
     """Positions from heading and slope; the radii depend on latitude, so latitude is iterated (converges at once)."""
     run = np.cos(slope_angle)
-    north = _integral(run * np.cos(heading), step)
-    east = _integral(run * np.sin(heading), step)
-    height = spec.height_m + _integral(np.sin(slope_angle), step)
+    north = _running_integral(run * np.cos(heading), step)
+    east = _running_integral(run * np.sin(heading), step)
+    height = spec.height_m + _running_integral(np.sin(slope_angle), step)
     latitude = np.full(heading.size, np.radians(spec.latitude_deg))
     for _ in range(4):
         middle = 0.5 * (latitude[1:] + latitude[:-1])
@@ -187,14 +191,14 @@ def _walk(spec: LineSpec, heading: Floats, slope_angle: Floats, step: float) -> 
     return RailPlaces(np.degrees(latitude), np.degrees(longitude), height, np.degrees(heading), np.tan(slope_angle))
 
 
-def _surveyed(
+def _surveyed_element(
     line: LineAxis, element_id: str, begin_m: float, length_m: float, left_m: float, reverse: bool
 ) -> pl.DataFrame:
     """A net element as it is surveyed."""
     points = int(np.ceil(length_m / line.spec.survey.spacing_m)) + 1
     measure = np.linspace(0.0, length_m, points)
     s_m = begin_m + (length_m - measure if reverse else measure)
-    places = line.at(s_m)
+    places = line.places_at(s_m)
     if left_m:
         places = offset_places(places, left_m)
     columns = {name: getattr(places, name) for name in _PLACE}

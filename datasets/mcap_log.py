@@ -41,15 +41,16 @@ def write_mcap(
     topics = [
         replace(topic, notes=recorded_notes(run, stream))
         for stream in STREAMS
-        for topic in _topics(run, stream, encoding, odometer_message, losses)
+        for topic in _stream_topics(run, stream, encoding, odometer_message, losses)
     ]
     write_topics(topics, path, "ros2" if encoding == "cdr" else "", compression, chunk_size, checksums)
     return tuple(losses)
 
 
-def _topics(
+def _stream_topics(
     run: RunLog, stream: Stream, encoding: Encoding, odometer_message: OdometerMessage, losses: list[str]
 ) -> list[Topic]:
+    """Topics of one stream in this encoding; what it cannot hold is appended to `losses`."""
     frame = run.stream(stream)
     if frame is None:
         return []
@@ -58,7 +59,7 @@ def _topics(
     if encoding == "protobuf":
         return [rows_topic(f"/{stream}", OWN_SCHEMAS[stream], frame, "protobuf")]
     if encoding == "cdr" and stream == "odometer" and frame["speed_mps"].null_count() == 0:
-        losses += _lost("odometer", frame, {"t", "speed_mps"})
+        losses += _lost_columns("odometer", frame, {"t", "speed_mps"})
         make = twist_topic if odometer_message.endswith("TwistStamped") else odometry_topic
         return [make(frame)]
     return [json_topic(stream, frame)]
@@ -66,13 +67,14 @@ def _topics(
 
 def _gnss_topics(frame: pl.DataFrame, encoding: Encoding, losses: list[str]) -> list[Topic]:
     """One topic per solution, for these messages do not name theirs."""
-    losses += _lost("gnss", frame, HELD)
+    losses += _lost_columns("gnss", frame, HELD)
     names = frame["solution"].unique(maintain_order=True).to_list()
     parts = [(name, frame.filter(pl.col("solution") == name)) for name in names]
     return [_gnss_topic("/gnss" if len(parts) == 1 else f"/{name}", part, encoding, losses) for name, part in parts]
 
 
 def _gnss_topic(topic: str, frame: pl.DataFrame, encoding: Encoding, losses: list[str]) -> Topic:
+    """A topic of positions; what its messages cannot hold is appended to `losses`."""
     if encoding == "cdr":
         if frame["fix"].is_in(["rtk_float", "rtk_fixed", "estimated"]).any():
             losses.append("gnss.fix")
@@ -87,7 +89,8 @@ def _gnss_topic(topic: str, frame: pl.DataFrame, encoding: Encoding, losses: lis
     return location_fix_topic(topic, located, _FRAME_ID)
 
 
-def _lost(stream: Stream, frame: pl.DataFrame, kept: set[str]) -> list[str]:
+def _lost_columns(stream: Stream, frame: pl.DataFrame, kept: set[str]) -> list[str]:
+    """Columns with values that the messages do not keep."""
     return [
         f"{stream}.{name}" for name in frame.columns if name not in kept and frame[name].null_count() < frame.height
     ]

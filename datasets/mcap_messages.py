@@ -34,17 +34,19 @@ _TWIST_PARTS = list(_PARTS)[:4]
 _TWIST_COVARIANCE_PARTS = list(_PARTS)[:5]
 
 
-def _definition(members: str, parts: list[str]) -> str:
+def _concatenate_definitions(members: str, parts: list[str]) -> str:
     """The concatenated form: the message, then all that it is made of."""
     return f"{'=' * 80}\n".join([members, *(f"MSG: {name}\n{_PARTS[name]}" for name in parts)])
 
 
 DEFINITIONS: dict[str, str] = {
-    "geometry_msgs/msg/TwistStamped": _definition("std_msgs/Header header\ngeometry_msgs/Twist twist\n", _TWIST_PARTS),
-    "geometry_msgs/msg/TwistWithCovarianceStamped": _definition(
+    "geometry_msgs/msg/TwistStamped": _concatenate_definitions(
+        "std_msgs/Header header\ngeometry_msgs/Twist twist\n", _TWIST_PARTS
+    ),
+    "geometry_msgs/msg/TwistWithCovarianceStamped": _concatenate_definitions(
         "std_msgs/Header header\ngeometry_msgs/TwistWithCovariance twist\n", _TWIST_COVARIANCE_PARTS
     ),
-    "nav_msgs/msg/Odometry": _definition(
+    "nav_msgs/msg/Odometry": _concatenate_definitions(
         "std_msgs/Header header\nstring child_frame_id\n"
         "geometry_msgs/PoseWithCovariance pose\ngeometry_msgs/TwistWithCovariance twist\n",
         list(_PARTS),
@@ -68,6 +70,7 @@ def _json_schema(stream: Stream) -> bytes:
 
 
 def _json_property(column: dy.Column) -> dict[str, object]:
+    """A column as a property of jsonschema."""
     named: dict[str, object] = {"description": column.description or ""}
     if isinstance(column, dy.Datetime):
         parts = {"sec": {"type": "integer"}, "nsec": {"type": "integer"}}
@@ -126,4 +129,5 @@ def _odometer_topic(name: str, frame: pl.DataFrame, texts: tuple[str, ...], valu
 
 
 def _times_ns(frame: pl.DataFrame) -> list[int]:
+    """Times of the first column [ns]."""
     return frame.to_series(0).to_physical().to_list()

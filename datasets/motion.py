@@ -28,7 +28,8 @@ class PhaseSpec(Settings):
     hold_m: NonNegative = 0.0
 
     @model_validator(mode="after")
-    def _one_aim(self) -> Self:
+    def _require_one_aim(self) -> Self:
+        """A phase has a speed or a stop, and holds a length only while moving."""
         if (self.speed_mps is None) == (self.stop_at_m is None):
             raise ValueError("a phase needs either speed_mps or stop_at_m")
         if self.hold_m and (self.hold_s or not self.speed_mps):
@@ -63,7 +64,7 @@ class Motion:
 
     def distance_m(self, t_s: Floats) -> Floats:
         """Distance from the start [m]; before the start and after the end the train stands."""
-        i, since = self._piece(t_s)
+        i, since = self._piece_at(t_s)
         distance: Floats = (
             self.distances_m[i] + self.speeds_mps[i] * since + 0.5 * self.accelerations_mps2[i] * since**2
         )
@@ -71,7 +72,7 @@ class Motion:
 
     def speed_mps(self, t_s: Floats) -> Floats:
         """Signed speed, positive ahead."""
-        i, since = self._piece(t_s)
+        i, since = self._piece_at(t_s)
         speed: Floats = self.speeds_mps[i] + self.accelerations_mps2[i] * since
         return speed
 
@@ -92,7 +93,8 @@ class Motion:
         share = -ahead[i - 1] / (ahead[i] - ahead[i - 1])
         return float(grid[i - 1] + share * (grid[i] - grid[i - 1]))
 
-    def _piece(self, t_s: Floats) -> tuple[npt.NDArray[np.int64], Floats]:
+    def _piece_at(self, t_s: Floats) -> tuple[npt.NDArray[np.int64], Floats]:
+        """The parabola that each time lies in, and the time since its begin [s]."""
         inside = np.clip(t_s, 0.0, self.duration_s)
         index = np.searchsorted(self.knots_s, inside, side="right") - 1
         return index, inside - self.knots_s[index]
@@ -102,15 +104,15 @@ def build_motion(spec: MotionSpec) -> Motion:
     """Lay the phases end to end; the journey ends with the last one."""
     sign = 1 if spec.direction is Direction.GROWING else -1
     pieces = _MotionPieces(spec.start_m, sign)
-    pieces.add(spec.stand_s, 0.0)
+    pieces.add_piece(spec.stand_s, 0.0)
     for phase in spec.phases:
         if phase.stop_at_m is not None:
-            pieces.stop(phase.stop_at_m, phase.acceleration_mps2)
+            pieces.stop_at_chainage(phase.stop_at_m, phase.acceleration_mps2)
         else:
-            pieces.reach(phase.speed_mps or 0.0, phase.acceleration_mps2)
+            pieces.reach_speed(phase.speed_mps or 0.0, phase.acceleration_mps2)
         hold_s = phase.hold_m / abs(pieces.speed) if phase.hold_m else phase.hold_s
-        pieces.add(hold_s, 0.0)
-    return pieces.motion()
+        pieces.add_piece(hold_s, 0.0)
+    return pieces.finish()
 
 
 class _MotionPieces:
@@ -122,7 +124,7 @@ class _MotionPieces:
         self.time, self.distance, self.speed = 0.0, 0.0, 0.0
         self.rows: list[tuple[float, float, float, float]] = []
 
-    def add(self, duration_s: float, acceleration: float) -> None:
+    def add_piece(self, duration_s: float, acceleration: float) -> None:
         """Go on at constant acceleration for a time."""
         if duration_s <= 0.0:
             return
@@ -131,13 +133,13 @@ class _MotionPieces:
         self.speed += acceleration * duration_s
         self.time += duration_s
 
-    def reach(self, speed: float, acceleration: float) -> None:
+    def reach_speed(self, speed: float, acceleration: float) -> None:
         """Accelerate or brake up to a speed."""
         change = speed - self.speed
-        self.add(abs(change) / acceleration, float(np.copysign(acceleration, change)))
+        self.add_piece(abs(change) / acceleration, float(np.copysign(acceleration, change)))
         self.speed = speed
 
-    def stop(self, at_m: float, deceleration: float) -> None:
+    def stop_at_chainage(self, at_m: float, deceleration: float) -> None:
         """Hold the speed until braking brings the train to a stand at the chainage."""
         left_m = self.sign * (at_m - self.start_m) - self.distance
         braking_m = 0.5 * self.speed * abs(self.speed) / deceleration
@@ -148,10 +150,10 @@ class _MotionPieces:
                 found=f"stop_at_m = {at_m}, {left_m:.1f} m ahead at {self.speed:.1f} m/s",
                 expected=f"at least {abs(braking_m):.1f} m to brake, in the direction of motion",
             )
-        self.add((left_m - braking_m) / self.speed, 0.0)
-        self.reach(0.0, deceleration)
+        self.add_piece((left_m - braking_m) / self.speed, 0.0)
+        self.reach_speed(0.0, deceleration)
 
-    def motion(self) -> Motion:
+    def finish(self) -> Motion:
         """The whole journey."""
         rows = [*self.rows, (self.time, self.distance, self.speed, 0.0)]
         columns = np.array(rows, dtype=np.float64).T

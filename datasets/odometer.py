@@ -8,7 +8,7 @@ import numpy as np
 import numpy.typing as npt
 import polars as pl
 
-from datasets.faults import NS_PER_S, FaultKind, FaultSpec, active, odometer_increments, odometer_speeds
+from datasets.faults import NS_PER_S, FaultKind, FaultSpec, is_active, odometer_increments, odometer_speeds
 from datasets.motion import Motion
 from datasets.scenario import OdometerSpec
 from schemas.arrays import Floats
@@ -37,12 +37,12 @@ def odometer_stream(
     noise = spec.noise_m_per_root_s * np.sqrt(step_s) * rng.standard_normal(t_s.size)
     noise[0] = 0.0
     increments = odometer_increments(faults, t_s, increments + np.where(moving, noise, 0.0))
-    speed = _speed(spec, motion, faults, t_s, rng)
+    speed = _reported_speed_mps(spec, motion, faults, t_s, rng)
     lost = np.zeros(t_s.size, dtype=np.bool_)
     for fault in faults:
         if fault.hits_odometer and fault.kind is FaultKind.OUTAGE:
-            lost |= active(fault, t_s)
-    return _table(spec, first_ns + t_ns, np.cumsum(increments), speed).filter(pl.Series(~lost))
+            lost |= is_active(fault, t_s)
+    return _odometer_table(spec, first_ns + t_ns, np.cumsum(increments), speed).filter(pl.Series(~lost))
 
 
 def sample_times_ns(duration_s: float, rate_hz: float) -> npt.NDArray[np.int64]:
@@ -51,7 +51,7 @@ def sample_times_ns(duration_s: float, rate_hz: float) -> npt.NDArray[np.int64]:
     return np.round(np.arange(count) * (NS_PER_S / rate_hz)).astype(np.int64)
 
 
-def _speed(
+def _reported_speed_mps(
     spec: OdometerSpec, motion: Motion, faults: Sequence[FaultSpec], t_s: Floats, rng: np.random.Generator
 ) -> Floats:
     """Speed that the odometer reports [m/s]."""
@@ -60,7 +60,10 @@ def _speed(
     return odometer_speeds(faults, t_s, true / spec.scale) + noise
 
 
-def _table(spec: OdometerSpec, t_ns: npt.NDArray[np.int64], distance_m: Floats, speed_mps: Floats) -> pl.DataFrame:
+def _odometer_table(
+    spec: OdometerSpec, t_ns: npt.NDArray[np.int64], distance_m: Floats, speed_mps: Floats
+) -> pl.DataFrame:
+    """The stream `odometer`, with what the sensor is said to give."""
     nothing = pl.lit(None, pl.Float64)
     table = pl.DataFrame({"t": t_ns}).with_columns(
         t=pl.col("t").cast(pl.Datetime("ns", "UTC")),

@@ -41,7 +41,7 @@ def random_trial(seed: int) -> RandomTrial:
     rng = np.random.default_rng([20250303, seed])
     kind = KINDS[seed % len(KINDS)]
     for _ in range(_DRAWS):
-        scenario = _scenario(seed, rng, kind)
+        scenario = _random_scenario(seed, rng, kind)
         spec = scenario.runs[0]
         rows = expected_hazards(scenario, spec)
         if rows is not None:
@@ -52,14 +52,14 @@ def random_trial(seed: int) -> RandomTrial:
     raise AssertionError(f"no clear trial of kind {kind!r} in {_DRAWS} draws")
 
 
-def _scenario(seed: int, rng: np.random.Generator, kind: str) -> Scenario:
+def _random_scenario(seed: int, rng: np.random.Generator, kind: str) -> Scenario:
     """A scenario drawn by a seed."""
     sigma_m = float(rng.choice([0.5, 1.0, 1.5]))
     scale = float(rng.choice([1.0, 1.003, 0.996]))
     latency_s = float(rng.choice([0.0, 0.08]))
     places_m = 500.0 + np.cumsum(rng.uniform(400.0, 1500.0, 9))
     forward = bool(rng.random() < 0.5)
-    motion = _motion(rng, forward)
+    motion = _random_motion(rng, forward)
     run: dict[str, Any] = {
         "id": f"trial{seed}",
         "vehicle": kind in ("ramp", "slow ramp") or bool(rng.random() < 0.7),
@@ -74,7 +74,7 @@ def _scenario(seed: int, rng: np.random.Generator, kind: str) -> Scenario:
             "latency_s": latency_s,
         },
         "odometer": {"rate_hz": float(rng.choice([5.0, 20.0, 50.0])), "scale": scale},
-        "faults": _faults(rng, kind, build_motion(RunSpec.model_validate({"id": "m", "motion": motion}).motion)),
+        "faults": _random_fault(rng, kind, build_motion(RunSpec.model_validate({"id": "m", "motion": motion}).motion)),
     }
     return Scenario.model_validate(
         {
@@ -103,7 +103,7 @@ def _scenario(seed: int, rng: np.random.Generator, kind: str) -> Scenario:
     )
 
 
-def _motion(rng: np.random.Generator, forward: bool) -> dict[str, Any]:
+def _random_motion(rng: np.random.Generator, forward: bool) -> dict[str, Any]:
     """A motion drawn at random."""
     phases: list[dict[str, Any]] = [
         {"speed_mps": float(rng.uniform(20.0, 30.0)), "hold_s": float(rng.uniform(60.0, 100.0))}
@@ -121,7 +121,7 @@ def _motion(rng: np.random.Generator, forward: bool) -> dict[str, Any]:
     }
 
 
-def _faults(rng: np.random.Generator, kind: str, motion: Motion) -> list[dict[str, Any]]:
+def _random_fault(rng: np.random.Generator, kind: str, motion: Motion) -> list[dict[str, Any]]:
     """One fault in the middle of the run, where the train has run for a while; slow ones begin earlier."""
     part = rng.uniform(0.25, 0.5) if kind == "slow ramp" else rng.uniform(0.45, 0.8)
     start_s = float(part * motion.duration_s)

@@ -10,7 +10,7 @@ import polars as pl
 
 from datasets.faults import NS_PER_S, FaultSpec, PositionEffect, position_effect
 from datasets.gnss_errors import position_errors
-from datasets.line import LineAxis, RailPlaces, offset_places, shifted
+from datasets.line import LineAxis, RailPlaces, offset_places, shift_places
 from datasets.motion import Motion
 from datasets.odometer import sample_times_ns
 from datasets.scenario import GnssSpec, ReferenceSpec
@@ -47,13 +47,13 @@ class TrainOnLine:
     motion: Motion
     vehicle: Vehicle
 
-    def antenna(self, t_s: Floats, ahead_m: Floats | float = 0.0, left_m: Floats | float = 0.0) -> RailPlaces:
+    def antenna_places(self, t_s: Floats, ahead_m: Floats | float = 0.0, left_m: Floats | float = 0.0) -> RailPlaces:
         """Antenna places; `ahead_m` follows the track towards the leading end, `left_m` is left of that end."""
         lever_m = self.vehicle.gnss_antenna_ahead_m + ahead_m
-        rail = self.line.at(self.motion.chainage_m(t_s) + self.motion.sign * lever_m)
+        rail = self.line.places_at(self.motion.chainage_m(t_s) + self.motion.sign * lever_m)
         over_ground = offset_places(rail, self.motion.sign * left_m)
         zeros = np.zeros(t_s.size)
-        return shifted(over_ground, zeros, zeros, zeros + self.vehicle.antenna_height_m)
+        return shift_places(over_ground, zeros, zeros, zeros + self.vehicle.antenna_height_m)
 
 
 def gnss_streams(
@@ -62,10 +62,10 @@ def gnss_streams(
     """The `gnss` stream, and `satellites` where the errors come from geometry; displaced and thinned by faults."""
     t_ns = sample_times_ns(journey.motion.duration_s, spec.rate_hz)
     if spec.sky is None:
-        observed = [_without_sky(spec, t_ns.size, rng)]
+        observed = [_observe_without_sky(spec, t_ns.size, rng)]
         ranges = None
     else:
-        start = journey.antenna(np.zeros(1))
+        start = journey.antenna_places(np.zeros(1))
         place = (float(start.latitude_deg[0]), float(start.longitude_deg[0]), float(start.height_m[0]))
         observed, ranges = observe_sky(spec.sky, place, first_ns, t_ns, 1.0 / spec.rate_hz, faults, rng)
     velocity_rng = rng.spawn(1)[0]
@@ -73,7 +73,7 @@ def gnss_streams(
     return pl.concat(tables).sort("t", "solution", maintain_order=True), ranges
 
 
-def _without_sky(spec: GnssSpec, epochs: int, rng: np.random.Generator) -> ObservedSky:
+def _observe_without_sky(spec: GnssSpec, epochs: int, rng: np.random.Generator) -> ObservedSky:
     """Position errors without satellites."""
     sigmas = (spec.sigma_east_m, spec.sigma_north_m, spec.sigma_up_m)
     covariance = np.broadcast_to(np.diag(np.square(sigmas)), (epochs, 3, 3))
@@ -101,16 +101,16 @@ def _solution_table(
     effect = position_effect(own, t_s, rng)
     bias = np.array([spec.bias_east_m, spec.bias_north_m, spec.bias_up_m])
     old_s = t_s - spec.latency_s - effect.latency_s
-    rail = journey.antenna(old_s, effect.along_m, effect.cross_m)
-    places = displaced(rail, effect, observed.error_m + bias)
-    velocity = _velocity(spec, journey, old_s, velocity_rng)
-    return _table(spec, first_ns + t_ns, places, velocity, observed, effect.lost | observed.lost)
+    rail = journey.antenna_places(old_s, effect.along_m, effect.cross_m)
+    places = displace(rail, effect, observed.error_m + bias)
+    velocity = _reported_velocity(spec, journey, old_s, velocity_rng)
+    return _gnss_table(spec, first_ns + t_ns, places, velocity, observed, effect.lost | observed.lost)
 
 
-def displaced(places: RailPlaces, effect: PositionEffect, errors_m: Floats) -> RailPlaces:
+def displace(places: RailPlaces, effect: PositionEffect, errors_m: Floats) -> RailPlaces:
     """Places with errors and the part of the faults that does not follow the track."""
     east, north, up = errors_m.T
-    return shifted(places, east + effect.east_m, north + effect.north_m, up + effect.up_m)
+    return shift_places(places, east + effect.east_m, north + effect.north_m, up + effect.up_m)
 
 
 def reference_stream(
@@ -122,7 +122,7 @@ def reference_stream(
     """
     t_ns = sample_times_ns(journey.motion.duration_s + 2.0 * _MARGIN_S, spec.rate_hz) - round(_MARGIN_S * NS_PER_S)
     noise = spec.sigma_m * rng.standard_normal((3, t_ns.size))
-    places = shifted(journey.antenna(t_ns / NS_PER_S), *noise)
+    places = shift_places(journey.antenna_places(t_ns / NS_PER_S), *noise)
     table = pl.DataFrame(
         {
             "t": first_ns + t_ns,
@@ -136,7 +136,7 @@ def reference_stream(
 
 def true_velocity(journey: TrainOnLine, t_s: Floats) -> Floats:
     """Velocity east, north, up [m/s], shape (epochs, 3)."""
-    places = journey.antenna(t_s)
+    places = journey.antenna_places(t_s)
     speed = journey.motion.sign * journey.motion.speed_mps(t_s)
     heading = np.radians(places.heading_deg)
     angle = np.arctan(places.slope)
@@ -144,13 +144,13 @@ def true_velocity(journey: TrainOnLine, t_s: Floats) -> Floats:
     return np.column_stack([level * np.sin(heading), level * np.cos(heading), speed * np.sin(angle)])
 
 
-def _velocity(spec: GnssSpec, journey: TrainOnLine, t_s: Floats, rng: np.random.Generator) -> Floats | None:
+def _reported_velocity(spec: GnssSpec, journey: TrainOnLine, t_s: Floats, rng: np.random.Generator) -> Floats | None:
     """Velocities that a receiver reports, if it does."""
     noise = spec.velocity_sigma_mps * rng.standard_normal((t_s.size, 3))
     return true_velocity(journey, t_s) + noise if spec.velocity else None
 
 
-def _table(
+def _gnss_table(
     spec: GnssSpec,
     t_ns: npt.NDArray[np.int64],
     places: RailPlaces,
@@ -158,6 +158,7 @@ def _table(
     observed: ObservedSky,
     lost: npt.NDArray[np.bool_],
 ) -> pl.DataFrame:
+    """The stream `gnss` of one solution."""
     unknown = np.full(t_ns.size, np.nan)
     covariance = spec.reported_factor**2 * observed.covariance_m2
     levels = [spec.reported_factor * level for level in (observed.hpl_m, observed.vpl_m)]

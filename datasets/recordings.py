@@ -86,6 +86,6 @@ def known_recording(path: Path) -> Converted | None:
     return infrabel.infrabel_recording(path) if all(name.encode() in head for name in infrabel.COLUMNS) else None
 
 
-def recordings() -> Recordings:
+def public_recordings() -> Recordings:
     """What a project needs to know of recordings."""
     return Recordings(known_recording, write_run_as)

@@ -38,13 +38,13 @@ class DrivenPath:
     def places(self, s_m: Floats) -> tuple[Floats, Floats, Floats]:
         """Positions at distances along the path; beyond its ends it goes on straight."""
         axes = (self.latitude_deg, self.longitude_deg, self.height_m)
-        latitude, longitude, height = (_interpolated(s_m, self.axis_m, values) for values in axes)
+        latitude, longitude, height = (_interpolate_beyond(s_m, self.axis_m, values) for values in axes)
         return latitude, longitude, height
 
 
 def driven_path(run: RunLog, solution: str, site: Site | None = None) -> DrivenPath:
     """The track of the site where one is given, else what the run's own positions show, averaged over 10 m."""
-    return _own_path(run, solution) if site is None else _site_path(run, solution, site)
+    return _path_of_positions(run, solution) if site is None else _path_of_site(run, solution, site)
 
 
 def displacement_m(driven: DrivenPath, t_ns: Ints, ahead_m: Floats, left_m: Floats) -> Floats:
@@ -57,25 +57,27 @@ def displacement_m(driven: DrivenPath, t_ns: Ints, ahead_m: Floats, left_m: Floa
     s_m, offset_m, own_m = (np.interp(now, known, at) for at in (driven.s_m, driven.left_m, driven.own_height_m))
     here = driven.places(s_m)
     there = driven.places(s_m + ahead_m)
-    east_here, north_here = _left_of(driven, s_m)
+    east_here, north_here = _left_direction(driven, s_m)
     # A position off the track stays as far off it where the track has turned.
     begin = moved_deg(*here, offset_m * east_here, offset_m * north_here)
-    east_there, north_there = _left_of(driven, s_m + ahead_m)
+    east_there, north_there = _left_direction(driven, s_m + ahead_m)
     end = moved_deg(*there, offset_m * east_there, offset_m * north_there)
-    east, north, _ = _local_m((*begin, own_m), (*end, own_m))
+    east, north, _ = _horizon_vector_m((*begin, own_m), (*end, own_m))
     return np.column_stack([east + left_m * east_here, north + left_m * north_here, there[2] - here[2]])
 
 
-def _left_of(driven: DrivenPath, s_m: Floats) -> tuple[Floats, Floats]:
+def _left_direction(driven: DrivenPath, s_m: Floats) -> tuple[Floats, Floats]:
     """East and north of the unit vector to the left of the path at these distances."""
-    course_e, course_n, _ = _local_m(driven.places(s_m - driven.course_m), driven.places(s_m + driven.course_m))
+    course_e, course_n, _ = _horizon_vector_m(
+        driven.places(s_m - driven.course_m), driven.places(s_m + driven.course_m)
+    )
     norm = np.hypot(course_e, course_n)
     return -course_n / norm, course_e / norm
 
 
-def _own_path(run: RunLog, solution: str) -> DrivenPath:
+def _path_of_positions(run: RunLog, solution: str) -> DrivenPath:
     """The path of the run's own positions, by odometer distance where recorded, else by that between positions."""
-    fixes = _fixes(run, solution)
+    fixes = _valid_positions(run, solution)
     t_ns = fixes["t"].to_physical().to_numpy()
     places = [fixes[name].to_numpy().astype(np.float64) for name in ("latitude_deg", "longitude_deg", "height_m")]
     places[2] = np.nan_to_num(places[2])
@@ -91,7 +93,7 @@ def _own_path(run: RunLog, solution: str) -> DrivenPath:
     return DrivenPath(t_ns, s_m, np.zeros_like(s_m), places[2], _BIN_M, *means)
 
 
-def _site_path(run: RunLog, solution: str, site: Site) -> DrivenPath:
+def _path_of_site(run: RunLog, solution: str, site: Site) -> DrivenPath:
     """The path by the site: every epoch of the run, and what lies beyond, at its place on the matched path."""
     prepared = prepare(run, site, Vehicle(), Configuration())
     fixes = prepared.fixes(solution)
@@ -104,7 +106,7 @@ def _site_path(run: RunLog, solution: str, site: Site) -> DrivenPath:
     axis = np.union1d(np.arange(s_m.min() - _BEYOND_M, s_m.max() + _BEYOND_M, _BIN_M / 2.0), points_m)
     leg = np.full(axis.size, epochs["leg"][0], dtype=np.int64)
     elements, measures = found.path.locate(leg, axis)
-    places = _on_track(site.track, elements.tolist(), measures)
+    places = _places_on_track(site.track, elements.tolist(), measures)
     left_m = epochs["cross_track_m"].to_numpy()
     own = fixes.join(epochs.select("t"), on="t", how="right", maintain_order="right")
     own_m = np.nan_to_num(floats(own, "height_m"))
@@ -117,7 +119,9 @@ _AT_POINT_M = 0.05
 _BEYOND_M = 5000.0
 
 
-def _on_track(track: pl.DataFrame, elements: list[str | None], measures: Floats) -> tuple[Floats, Floats, Floats]:
+def _places_on_track(
+    track: pl.DataFrame, elements: list[str | None], measures: Floats
+) -> tuple[Floats, Floats, Floats]:
     """Places on the track, by net element and measure."""
     names = np.array(elements, dtype=object)
     result = np.full((3, names.size), np.nan)
@@ -127,11 +131,11 @@ def _on_track(track: pl.DataFrame, elements: list[str | None], measures: Floats)
         at = points["measure_m"].to_numpy()
         for axis, name in enumerate(("latitude_deg", "longitude_deg", "height_m")):
             values = np.nan_to_num(points[name].to_numpy().astype(np.float64))
-            result[axis, rows] = _interpolated(measures[rows], at, values)
+            result[axis, rows] = _interpolate_beyond(measures[rows], at, values)
     return result[0], result[1], result[2]
 
 
-def _fixes(run: RunLog, solution: str) -> pl.DataFrame:
+def _valid_positions(run: RunLog, solution: str) -> pl.DataFrame:
     """Positions of one solution, those without fix left out."""
     fixes = run.gnss.filter(
         (pl.col("solution") == solution) & pl.col("latitude_deg").is_not_null() & (pl.col("fix") != "none")
@@ -171,7 +175,7 @@ def _distance_of_positions_m(latitude_deg: Floats, longitude_deg: Floats, height
     return np.interp(np.arange(latitude_deg.size), kept, np.concatenate(([0.0], np.cumsum(lengths))))
 
 
-def _interpolated(x: Floats, at: Floats, values: Floats) -> Floats:
+def _interpolate_beyond(x: Floats, at: Floats, values: Floats) -> Floats:
     """Linear interpolation that goes on beyond the ends with the mean slope of the outer cells."""
     order = np.argsort(at, kind="stable")
     at = at[order]
@@ -185,7 +189,7 @@ def _interpolated(x: Floats, at: Floats, values: Floats) -> Floats:
     )
 
 
-def _local_m(
+def _horizon_vector_m(
     origin: tuple[Floats, Floats, Floats], point: tuple[Floats, Floats, Floats]
 ) -> tuple[Floats, Floats, Floats]:
     """Vector between near places in the horizon of the first [m]."""

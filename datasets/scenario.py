@@ -37,7 +37,8 @@ class SectionSpec(Settings):
 
     @field_validator("radius_m")
     @classmethod
-    def _can_be_run(cls, value: float | None) -> float | None:
+    def _require_wide_curve(cls, value: float | None) -> float | None:
+        """A curve is no narrower than a main line's."""
         if value is not None and abs(value) < 100.0:
             raise ValueError("a radius under 100 m is too small for a main line")
         return value
@@ -61,6 +62,8 @@ class ParallelSpec(Settings):
 
 
 class BaliseSpec(Settings):
+    """A balise at a chainage of the line."""
+
     id: Identity
     at_m: NonNegative
     kind: BaliseKind = BaliseKind.VIRTUAL
@@ -99,6 +102,7 @@ class LineSpec(Settings):
 
 
 def _gps_alone() -> Mapping[str, tuple[Constellation, ...]]:
+    """One solution of GPS alone."""
     return {"primary": ("gps",)}
 
 
@@ -193,7 +197,8 @@ class Scenario(Settings):
 
     @model_validator(mode="before")
     @classmethod
-    def _hand_down(cls, data: object) -> object:
+    def _apply_common(cls, data: object) -> object:
+        """Runs with what is common to all."""
         if not isinstance(data, Mapping) or not isinstance(data.get("runs"), list):
             return data
         common = {name: data[name] for name in _COMMON if name in data}
@@ -201,11 +206,12 @@ class Scenario(Settings):
         return {**rest, "runs": [_with_defaults(run, common) for run in data["runs"]]}
 
     @model_validator(mode="after")
-    def _names_are_unique(self) -> Self:
-        _refuse_repeats("runs", [run.id for run in self.runs])
-        _refuse_repeats("line.balises", [balise.id for balise in self.line.balises])
+    def _require_unique_names(self) -> Self:
+        """Names occur once, and the start has a time zone."""
+        _require_unique("runs", [run.id for run in self.runs])
+        _require_unique("line.balises", [balise.id for balise in self.line.balises])
         tracks = [element.id for element in self.line.elements] + [p.id for p in self.line.parallels]
-        _refuse_repeats("line.elements", tracks)
+        _require_unique("line.elements", tracks)
         if self.start.tzinfo is None:
             raise ValueError("start needs a time zone, for example 2025-03-03T06:00:00Z")
         return self
@@ -238,7 +244,7 @@ def _with_defaults(run: object, common: Mapping[str, object]) -> object:
     return merged
 
 
-def _refuse_repeats(place: str, names: list[str]) -> None:
+def _require_unique(place: str, names: list[str]) -> None:
     """Refuse names that occur twice."""
     repeated = sorted({name for name in names if names.count(name) > 1})
     if repeated:

@@ -8,10 +8,10 @@ import numpy as np
 import polars as pl
 
 from datasets.constellation import GALILEO, GPS, look_angles
-from datasets.faults import NS_PER_S, FaultKind, FaultSpec, active, in_sector, offset_m
+from datasets.faults import NS_PER_S, FaultKind, FaultSpec, fault_offset_m, in_sector, is_active
 from datasets.range_errors import range_errors_m, range_sigma_m
 from datasets.scenario import SkySpec
-from datasets.solution import PositionSolution, protection_levels, solve
+from datasets.solution import PositionSolution, protection_levels, solve_positions
 from schemas.arrays import Bools, Floats, Ints
 from schemas.conform import conform
 from schemas.frozen import frozen
@@ -68,8 +68,8 @@ def observe_sky(
         initials = {_SLOTS[constellation][0].sv[0] for constellation in constellations}
         usable = ranges.tracked & np.array([sv[0] in initials for sv in ranges.svs])
         angles = (ranges.azimuth_deg, ranges.elevation_deg)
-        solution = solve(ranges.svs, *angles, ranges.sigma_m, ranges.range_error_m, usable, ranges.tracked)
-        observed.append(_observed(spec, name, solution))
+        solution = solve_positions(ranges.svs, *angles, ranges.sigma_m, ranges.range_error_m, usable, ranges.tracked)
+        observed.append(_observed_sky(spec, name, solution))
         tables.append(_satellites_table(name, first_ns + t_ns, ranges, solution))
     stream = pl.concat(tables).sort("t", "solution", "sv", maintain_order=True) if spec.record_ranges else None
     return observed, stream
@@ -97,17 +97,17 @@ def track_satellites(
             continue
         hit = in_sector(fault, svs, azimuth, elevation)
         if fault.kind is FaultKind.OUTAGE:
-            tracked = tracked & ~(hit & active(fault, t_s)[:, None])
+            tracked = tracked & ~(hit & is_active(fault, t_s)[:, None])
         elif fault.kind is FaultKind.NOISE:
             noise = (fault.sigma_m or 0.0) * rng.standard_normal(errors.shape)
-            errors = errors + np.where(hit & active(fault, t_s)[:, None], noise, 0.0)
+            errors = errors + np.where(hit & is_active(fault, t_s)[:, None], noise, 0.0)
         else:
-            errors = errors + np.where(hit, offset_m(fault, t_s, rng)[:, None], 0.0)
+            errors = errors + np.where(hit, fault_offset_m(fault, t_s, rng)[:, None], 0.0)
     sigma = range_sigma_m(spec.ranges, elevation)
     return SimulatedRanges(svs, azimuth, elevation, sigma, errors, tracked)
 
 
-def _observed(spec: SkySpec, name: str, solution: PositionSolution) -> ObservedSky:
+def _observed_sky(spec: SkySpec, name: str, solution: PositionSolution) -> ObservedSky:
     """Errors and protection levels as the receiver has them."""
     levels = protection_levels(solution.covariance_m2)
     horizontal = levels.hpl_pa_m if spec.protection == "pa" else levels.hpl_npa_m

@@ -67,7 +67,7 @@ def least_squares(design: Floats, sigma_m: Floats) -> tuple[Floats, Floats]:
     return covariance, gain
 
 
-def solve(
+def solve_positions(
     svs: Sequence[str],
     azimuth_deg: Floats,
     elevation_deg: Floats,
@@ -86,7 +86,7 @@ def solve(
     covariance = np.full((epochs, 3, 3), np.nan)
     residual = np.full(usable.shape, np.nan)
     solved = np.zeros(epochs, dtype=np.bool_)
-    patterns, of_epoch = _patterns(usable, visible)
+    patterns, of_epoch = _satellite_patterns(usable, visible)
     for number, first in enumerate(patterns):
         taken = np.flatnonzero(usable[first])
         shown = np.flatnonzero(visible[first])
@@ -109,7 +109,7 @@ def solve(
     return PositionSolution(error, covariance, residual, usable & solved[:, None], solved)
 
 
-def _patterns(usable: Bools, visible: Bools) -> tuple[Ints, Ints]:
+def _satellite_patterns(usable: Bools, visible: Bools) -> tuple[Ints, Ints]:
     """Epochs that differ in which satellites they have: the first epoch of each kind, and the kind of every epoch."""
     packed = np.packbits(np.concatenate([usable, visible], axis=1), axis=1)
     # As bytes they are compared at once; as rows of an array it takes longer than all the positions.

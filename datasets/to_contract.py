@@ -17,7 +17,7 @@ from schemas.inputs import Balises
 from schemas.run import Stream
 
 
-def conformed(frame: pl.DataFrame, stream: Stream, place: Path) -> pl.DataFrame:
+def conform_stream(frame: pl.DataFrame, stream: Stream, place: Path) -> pl.DataFrame:
     """The stream as the contract has it; NaN is not known."""
     breaches: list[InputError] = []
     found = conform(frame.with_columns(cs.float().fill_nan(None)), stream, str(place), breaches)
@@ -27,7 +27,7 @@ def conformed(frame: pl.DataFrame, stream: Stream, place: Path) -> pl.DataFrame:
 
 def virtual_balises(places: Sequence[tuple[str, float]]) -> pl.DataFrame:
     """Virtual balises VB1, VB2, ... at (net element, measure), with the default settings."""
-    return table_of(
+    return table_of_contract(
         Balises,
         balise_id=[f"VB{number}" for number in range(1, len(places) + 1)],
         netelement_id=[element for element, _ in places],
@@ -40,7 +40,7 @@ def virtual_balises(places: Sequence[tuple[str, float]]) -> pl.DataFrame:
     )
 
 
-def table_of(schema: type[Schema], **columns: object) -> pl.DataFrame:
+def table_of_contract(schema: type[Schema], **columns: object) -> pl.DataFrame:
     """A table of the contract: scalars are repeated, columns that are not given are null."""
     rows = max(len(value) for value in columns.values() if isinstance(value, pl.Series | np.ndarray | list))
     full = {

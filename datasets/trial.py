@@ -37,17 +37,18 @@ def build_site(scenario: Scenario, line: LineAxis | None = None) -> Site:
     """The surveyed site of a scenario."""
     line = line or build_line(scenario.line)
     balises = balises_table(scenario.line) if scenario.line.balises else None
-    return Site(track_table(line, _rng(scenario, "site", "survey")), links_table(scenario.line), balises)
+    return Site(track_table(line, _named_generator(scenario, "site", "survey")), links_table(scenario.line), balises)
 
 
 def build_run(scenario: Scenario, spec: RunSpec, line: LineAxis | None = None) -> RunLog:
     """Simulate one run."""
     journey = TrainOnLine(line or build_line(scenario.line), build_motion(spec.motion), scenario.vehicle or Vehicle())
     first_ns = _start_ns(scenario, spec)
-    faults = [placed(fault, journey.motion, spec.gnss.rate_hz) for fault in spec.faults]
+    faults = [place_fault(fault, journey.motion, spec.gnss.rate_hz) for fault in spec.faults]
 
     def rng(purpose: str) -> np.random.Generator:
-        return _rng(scenario, spec.id, purpose)
+        """Random numbers of this run for one purpose."""
+        return _named_generator(scenario, spec.id, purpose)
 
     gnss, satellites = gnss_streams(spec.gnss, journey, faults, first_ns, rng("gnss"))
     last_ns = first_ns + round(journey.motion.duration_s * 1e9)
@@ -60,10 +61,11 @@ def build_run(scenario: Scenario, spec: RunSpec, line: LineAxis | None = None) -
     return RunLog(spec.id, gnss, odometer=odometer, satellites=satellites, reference=reference, faults=truth)
 
 
-def placed(fault: PlacedFault, motion: Motion, rate_hz: float) -> FaultSpec:
-    """A fault with its times: from the first GNSS epoch once the train is at its place."""
+def place_fault(fault: PlacedFault, motion: Motion, rate_hz: float) -> FaultSpec:
+    """A fault with its times: from the first GNSS epoch on once the train is at its place."""
 
     def epoch_s(time_s: float) -> float:
+        """The first epoch at or after a time [s]."""
         return float(np.ceil(time_s * rate_hz - 1e-9) / rate_hz)
 
     start_s = epoch_s(motion.time_at(fault.at_m) if fault.at_m is not None else fault.begins_s())
@@ -137,6 +139,6 @@ def _start_ns(scenario: Scenario, spec: RunSpec) -> int:
     return int(start.timestamp()) * 1_000_000_000 + start.microsecond * 1000
 
 
-def _rng(scenario: Scenario, owner: str, purpose: str) -> np.random.Generator:
+def _named_generator(scenario: Scenario, owner: str, purpose: str) -> np.random.Generator:
     """Independent random numbers by name; CRC-32 serves as a stable number of a name."""
     return np.random.default_rng([scenario.seed, zlib.crc32(owner.encode()), zlib.crc32(purpose.encode())])

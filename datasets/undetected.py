@@ -31,7 +31,7 @@ def largest_fault(
     return profile_at(monitored, epoch_of(monitored, balise, at_s), behind)
 
 
-def sentence_of(found: FaultProfile) -> str:
+def fault_sentence(found: FaultProfile) -> str:
     """The fault in words: how large, since when, and what a ramp and a step would have reached."""
     began, reached = (stamp.strftime("%H:%M:%S") for stamp in found.t)
     return (
@@ -41,7 +41,7 @@ def sentence_of(found: FaultProfile) -> str:
     )
 
 
-def figures_of(found: FaultProfile) -> dict[str, object]:
+def fault_figures(found: FaultProfile) -> dict[str, object]:
     """The fault for programs: when it begins and reaches its size, its sizes [m], the monitors at their thresholds."""
     t_start, t_reached = found.t
     sizes = {"error_m": found.error_m, "bound_m": found.bound_m, "ramp_m": found.ramp_m, "step_m": found.step_m}

@@ -52,17 +52,17 @@ def replay(run: RunLog, site: Site, vehicle: Vehicle | None = None, config: Conf
     """
     prepared = prepare(run, site, vehicle or Vehicle(), config or Configuration(), clock_advice)
     evidence = prepared.evidence()
-    channel = _compared_with(prepared)
+    channel = _fit_channel_reference(prepared)
     errors: list[InputError] = []
     parts: list[Tables] = []
     # A solution at a time: of those done only the tables are kept.
     for solution in prepared.run.solutions():
         try:
-            parts.append(_of_solution(prepared, solution, channel, evidence))
+            parts.append(_replay_solution(prepared, solution, channel, evidence))
         except InputError as error:
             # A receiver that never had a fix must not take the run's other solutions with it.
             errors.append(error)
-            parts.append(_failed(prepared, solution, error))
+            parts.append(_failed_tables(prepared, solution, error))
     if len(errors) == len(parts):
         raise errors[0]
     return RunTables(run_id=run.run_id, **(parts[0] if len(parts) == 1 else _below_one_another(parts)))
@@ -92,12 +92,12 @@ def monitor_alone(run: RunLog, site: Site, vehicle: Vehicle, config: Configurati
     if solution not in run.solutions():
         raise InputError("has no such solution", place=run.run_id, found=solution, expected=", ".join(run.solutions()))
     prepared = prepare(run, site, vehicle, config, clock_advice)
-    _, matches = _fitted(prepared, solution, _compared_with(prepared))
+    _, matches = _fit_and_match(prepared, solution, _fit_channel_reference(prepared))
     return monitor_solution(prepared, solution, matches, prepared.evidence())
 
 
-def _compared_with(prepared: PreparedRun) -> Channel:
-    """The solution that the channel monitor compares with, the only one whose match is kept over all solutions.
+def _fit_channel_reference(prepared: PreparedRun) -> Channel:
+    """The fit and match of the solution that the channel monitor compares with, kept over all solutions.
 
     Empty where that solution does not fit the run or lies on no track: then it has a failed row of its own.
     """
@@ -110,23 +110,23 @@ def _compared_with(prepared: PreparedRun) -> Channel:
         return {}
 
 
-def _fitted(prepared: PreparedRun, solution: str, channel: Channel) -> tuple[Fit, Matches]:
+def _fit_and_match(prepared: PreparedRun, solution: str, channel: Channel) -> tuple[Fit, Matches]:
     """How the solution fits the run, and its match beside that of the channel; raises `InputError` as both do."""
     known = channel.get(solution)
     fit, match = known or (required_fit(prepared, solution, prepared.vehicle), prepared.match(solution))
     return fit, {**{name: other for name, (_, other) in channel.items()}, solution: match}
 
 
-def _of_solution(prepared: PreparedRun, solution: str, channel: Channel, evidence: TrainEvidence) -> Tables:
-    """What the train made of one solution, what nobody would have noticed, and what the judge says of it.
+def _replay_solution(prepared: PreparedRun, solution: str, channel: Channel, evidence: TrainEvidence) -> Tables:
+    """The five tables of one solution: what the train made of it, what nobody would have noticed, what the judge says.
 
     Raises `InputError` where the solution does not fit the run or lies on no track.
     """
-    fit, matches = _fitted(prepared, solution, channel)
+    fit, matches = _fit_and_match(prepared, solution, channel)
     monitored = monitor_solution(prepared, solution, matches, evidence)
     unnoticed = largest_unnoticed(monitored)
-    judged = judge(_case(monitored, unnoticed, evidence, fit.leaps_s(evidence.shares_odometer_clock)))
-    results = _results(monitored, judged, unnoticed, fit, evidence)
+    judged = judge(_judge_input(monitored, unnoticed, evidence, fit.leaps_s(evidence.shares_odometer_clock)))
+    results = _collect_results(monitored, judged, unnoticed, fit, evidence)
     suspect = pl.Series("suspect_after_the_fact", judged.suspect_after_the_fact)
     of_fixes = monitored.solution.fixes["satellites"]
     columns = (suspect, *results.lost.columns(), of_fixes, *unnoticed.epochs)
@@ -139,10 +139,10 @@ def _of_solution(prepared: PreparedRun, solution: str, channel: Channel, evidenc
     }
 
 
-def _case(
+def _judge_input(
     monitored: MonitoredSolution, unnoticed: Undetected, evidence: TrainEvidence, leaps_s: Sequence[int]
 ) -> JudgeInput:
-    """The solution before the judge."""
+    """What the judge is given of one solution."""
     replayed = monitored.solution
     run = monitored.prepared.run
     return JudgeInput(
@@ -157,10 +157,10 @@ def _case(
     )
 
 
-def _results(
+def _collect_results(
     monitored: MonitoredSolution, judged: Judged, unnoticed: Undetected, fit: Fit, evidence: TrainEvidence
 ) -> SolutionResults:
-    """All that the `runs` row is made of."""
+    """All that the `runs` row of one solution is made of: figures, notes, and the reasons against a verdict."""
     prepared = monitored.prepared
     run = prepared.run
     accuracy = accuracy_checks(judged.epochs, run.faults, prepared.config)
@@ -187,7 +187,7 @@ def _results(
         Reason.ODOMETER_FOLLOWS_GNSS: odometry is not None and odometry.follows_gnss,
         Reason.EVIDENCE_DISPUTED: evidence.count_disputed_reads > 0 or evidence.parted,
         Reason.EVIDENCE_CONTRADICTED: evidence.doubted > 0,
-        Reason.TRACK_ASSUMED: _track_assumed(judged),
+        Reason.TRACK_ASSUMED: _rests_on_assumed_track(judged),
         Reason.SIGMA_DOUBTFUL: refuted(accuracy),
         Reason.INPUT_DOUBTFUL: bool(
             fit.unproving or fit.leaps_s(evidence.shares_odometer_clock) or counts.contradicting
@@ -208,13 +208,13 @@ def _results(
     )
 
 
-def _track_assumed(judged: Judged) -> bool:
-    """Positions in use or accepted balises would be right if the survey held the train's track."""
+def _rests_on_assumed_track(judged: Judged) -> bool:
+    """Whether a position in use or an accepted balise is right only if the train's track is the surveyed one."""
     used = judged.epochs.in_use & judged.epochs.judgements.track_assumed
     return bool(used.any() or (judged.offers.accepted & judged.offers.judged.track_assumed).any())
 
 
-def _failed(prepared: PreparedRun, solution: str, error: InputError) -> Tables:
-    """A solution without content but for the row that says why."""
+def _failed_tables(prepared: PreparedRun, solution: str, error: InputError) -> Tables:
+    """The five tables of a solution that cannot be replayed: empty but for the `runs` row that says why."""
     nothing = {name: table.create_empty() for name, table in TABLES.items()}
     return nothing | {"runs": shaped(failed_row(str(error), prepared.provenance, solution), TABLES["runs"])}

@@ -87,7 +87,7 @@ def _wrong(breach: ErrorDetails) -> str:
     text = _WORDS.get(breach["type"], breach["msg"].removeprefix("Value error, "))
     found = breach["input"]
     single = isinstance(found, str | int | float) and breach["type"] != "missing"
-    return f"{key}: {_filled(text, breach.get('ctx') or {})}" + (f", found {_shown(found)}" if single else "")
+    return f"{key}: {_fill_text(text, breach.get('ctx') or {})}" + (f", found {_shown(found)}" if single else "")
 
 
 def _shown(value: object) -> str:
@@ -96,7 +96,8 @@ def _shown(value: object) -> str:
     return "a very large integer" if long else repr(value)[:100]
 
 
-def _filled(text: str, context: Mapping[str, Any]) -> str:
+def _fill_text(text: str, context: Mapping[str, Any]) -> str:
+    """A text with its placeholders filled in; as it stands where that cannot be."""
     try:
         return text.format_map(context)
     except (KeyError, ValueError, IndexError):

@@ -249,7 +249,8 @@ class IngestConfig(StreamMappings[StreamMapping]):
 
     @model_validator(mode="before")
     @classmethod
-    def _one_table_or_many(cls, data: object) -> object:
+    def _as_lists(cls, data: object) -> object:
+        """One table of a kind as a list of one."""
         if not isinstance(data, Mapping):
             return data
         alone = {"wraps"}

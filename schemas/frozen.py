@@ -67,6 +67,7 @@ def _equality(values: Callable[[Any], tuple[Any, ...]]) -> Callable[[Any, object
     """What compares two of a class by their values."""
 
     def equals(self: Any, other: object) -> bool:
+        """Whether both are of one class and have the same values."""
         return bool(values(self) == values(other)) if other.__class__ is self.__class__ else NotImplemented
 
     return equals
@@ -82,6 +83,7 @@ def _initialiser(
     complete = _completion(name, shown)
 
     def initialise(self: Any, /, *given: Any, **named: Any) -> None:
+        """Set the fields from arguments and defaults, then call `after`."""
         values = self.__dict__
         if given:
             values.update(zip(names, given, strict=False))
@@ -103,6 +105,7 @@ def _completion(name: str, shown: Mapping[str, Field[Any]]) -> Callable[[dict[st
     factories = {each.name: each.default_factory for each in shown.values() if each.default_factory is not MISSING}
 
     def complete(values: dict[str, Any]) -> None:
+        """Put defaults in for the fields that have no value yet."""
         for missing in shown:
             if missing in values:
                 continue

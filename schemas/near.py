@@ -21,6 +21,7 @@ def nearest(name: str, known: Iterable[str]) -> list[str]:
     """
 
     def unlike(item: str) -> tuple[float, str]:
+        """Sort key, lower where a name is more alike: letters in common and share of words in common."""
         words, others = (set(text.lower().split("_")) for text in (name, item))
         letters = difflib.SequenceMatcher(None, name.lower(), item.lower()).ratio()
         return -letters - len(words & others) / len(words | others), item

@@ -253,10 +253,11 @@ def configuration_of(project: Project, file: Path) -> Configuration:
     if project.track is not None and project.track.survey_complete:
         complete = config.evidence.model_copy(update={"survey_complete": True})
         config = config.model_copy(update={"evidence": complete})
-    return _at_level(config, project.service_level, file)
+    return _with_service_level(config, project.service_level, file)
 
 
-def _at_level(config: Configuration, level: str | None, file: Path) -> Configuration:
+def _with_service_level(config: Configuration, level: str | None, file: Path) -> Configuration:
+    """The configuration with the service level of the project; raises `ConfigError` for an unknown one."""
     if level is None:
         return config
     if level not in config.safety.service_levels:

@@ -102,7 +102,7 @@ def _texts_in(model: type[BaseModel]) -> dict[str, tuple[str, str]]:
     assert isinstance(body, ast.ClassDef)
     texts: dict[str, tuple[str, str]] = {}
     for field, below in zip(body.body, body.body[1:], strict=False):
-        if isinstance(field, ast.AnnAssign) and isinstance(field.target, ast.Name) and (text := _string(below)):
+        if isinstance(field, ast.AnnAssign) and isinstance(field.target, ast.Name) and (text := _string_of(below)):
             meaning, _, reason = text.partition("\n\n")
             texts[field.target.id] = (" ".join(meaning.split()), " ".join(reason.split()))
     return texts
@@ -127,33 +127,36 @@ def keys(model: type[BaseModel], prefix: str = "") -> Iterator[Key]:
         elif isinstance(value, dict) and value:
             yield from _keys_of_instances(value, f"{prefix}{name}.", reason)
         else:
-            yield Key(prefix + name, _default(field, value), meaning, reason)
+            yield Key(prefix + name, _default_words(field, value), meaning, reason)
 
 
 def settings_markdown() -> str:
     """The whole page."""
     parts = [_INTRODUCTION]
     for name, section in Configuration():
-        parts.append(f"\n## `[{name}]`\n\n{_about(type(section))}\n\n{_table(keys(type(section), f'{name}.'))}")
+        parts.append(f"\n## `[{name}]`\n\n{_class_text(type(section))}\n\n{_table(keys(type(section), f'{name}.'))}")
     for title, model in _TABLES:
-        parts.append(f"\n## {title}\n\n{_about(model)}\n\n{_table(keys(model))}")
+        parts.append(f"\n## {title}\n\n{_class_text(model)}\n\n{_table(keys(model))}")
     return "".join(parts)
 
 
 def _keys_of_instances(instances: dict[str, BaseModel], prefix: str, reason: str) -> Iterator[Key]:
+    """Keys of the instances of a table of settings, such as the sigmas by kind of fix."""
     for instance, values in instances.items():
         texts = field_texts(type(values))
         for name, value in values:
             yield Key(f"{prefix}{instance}.{name}", str(value), texts[name][0], reason)
 
 
-def _string(node: ast.stmt) -> str:
+def _string_of(node: ast.stmt) -> str:
+    """The text of a statement that is nothing but a string, else an empty text."""
     if isinstance(node, ast.Expr) and isinstance(node.value, ast.Constant) and isinstance(node.value.value, str):
         return inspect.cleandoc(node.value.value)
     return ""
 
 
-def _default(field: FieldInfo, value: object) -> str:
+def _default_words(field: FieldInfo, value: object) -> str:
+    """The default of a key in words."""
     if field.is_required():
         return "required"
     match value:
@@ -171,7 +174,8 @@ def _default(field: FieldInfo, value: object) -> str:
             return str(value)
 
 
-def _about(model: type[BaseModel]) -> str:
+def _class_text(model: type[BaseModel]) -> str:
+    """The docstring of a settings class without its indentation."""
     return inspect.cleandoc(model.__doc__ or "")
 
 

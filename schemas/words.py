@@ -63,25 +63,27 @@ def say_of(section: str, name: str, figures: Mapping[str, object]) -> str:
     """
 
     def part(match: re.Match[str]) -> str:
+        """A part of a sentence; nothing where its figure is zero or not known."""
         first = next(field for _, field, _, _ in Formatter().parse(match[1]) if field)
         return match[1] if figures[first] else ""
 
     return _OPTIONAL.sub(part, str(WORDS[section][name])).format_map(figures)
 
 
-def _sentences(kind: type[Code], section: str) -> dict[Code, str]:
+def _sentences_by_code(kind: type[Code], section: str) -> dict[Code, str]:
+    """The sentence of each code of an enumeration."""
     return {code: WORDS[section][code.value] for code in kind}
 
 
-NOTES = _sentences(Note, "notes")
-REASONS = _sentences(Reason, "reasons")
-CAUSES = _sentences(MisfitCause, "causes")
-MISFIT_PLACES = _sentences(MisfitPlace, "misfit_places")
-LOST = _sentences(LostTo, "lost")
-NOT_SHOWN = _sentences(NotShown, "not_shown")
-REMEDIES = _sentences(Remedy, "remedies")
-EVIDENCE_LIMITS = _sentences(Evidence, "evidence_limits")
-JUDGES: Mapping[str, str] = {kind.value: words for kind, words in _sentences(Evidence, "judges").items()}
+NOTES = _sentences_by_code(Note, "notes")
+REASONS = _sentences_by_code(Reason, "reasons")
+CAUSES = _sentences_by_code(MisfitCause, "causes")
+MISFIT_PLACES = _sentences_by_code(MisfitPlace, "misfit_places")
+LOST = _sentences_by_code(LostTo, "lost")
+NOT_SHOWN = _sentences_by_code(NotShown, "not_shown")
+REMEDIES = _sentences_by_code(Remedy, "remedies")
+EVIDENCE_LIMITS = _sentences_by_code(Evidence, "evidence_limits")
+JUDGES: Mapping[str, str] = {kind.value: words for kind, words in _sentences_by_code(Evidence, "judges").items()}
 
 
 @frozen

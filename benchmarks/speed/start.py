@@ -31,7 +31,7 @@ def stop(*given, **named):
     print(len({'scipy', 'duckdb', 'rich', 'jinja2', 'pandas'} & set(sys.modules)), time.process_time(), flush=True)
     os._exit(0)
 worker.RecordedLog = stop
-cli._guarded(sys.argv[1:], False)
+cli._run_guarded(sys.argv[1:], False)
 """
 
 

@@ -22,7 +22,7 @@ from datasets.experiment.geometry import CONSTELLATIONS, Constellation, default_
 from datasets.experiment.monte_carlo import BLOCK_EPOCHS, ExperimentPlan, bank_forms, failure_forms, first_passages
 from datasets.experiment.range_system import RangePlan, range_system
 from datasets.experiment.sampling import Probability, missed_detection_probability
-from datasets.experiment.workers import generator
+from datasets.experiment.workers import random_generator
 from pipeline.results.workers import map_in_processes
 
 _NORMALS = 15
@@ -94,13 +94,13 @@ def _one_chunk(constellation: Constellation) -> tuple[float, float]:
     plan = ExperimentPlan(default_geometry(constellation))
     banks, failures = bank_forms(plan), failure_forms(plan)
     numbers = np.empty((BLOCK_EPOCHS, _NORMALS, _CHUNK))
-    rng = generator(1)
+    rng = random_generator(1)
 
     def draw() -> None:
         for at in range(0, plan.span_s, BLOCK_EPOCHS):
             rng.standard_normal(out=numbers[: min(BLOCK_EPOCHS, plan.span_s - at)])
 
-    return _cpu_s(draw), _cpu_s(lambda: first_passages(plan, banks, failures, _CHUNK, generator(2)))
+    return _cpu_s(draw), _cpu_s(lambda: first_passages(plan, banks, failures, _CHUNK, random_generator(2)))
 
 
 def _cpu_s(work: Callable[[], object]) -> float:

@@ -13,9 +13,9 @@ from pathlib import Path
 
 from benchmarks.results import Figure, stopwatch
 from benchmarks.trials import line_scenario
-from datasets.experiment.recorded.baseline import Baseline, Onset, baseline_of, numbered, onsets_of, room_of
+from datasets.experiment.recorded.baseline import Baseline, Onset, baseline_of, number_onsets, onsets_of, room_of
 from datasets.experiment.recorded.command import recorded_experiment
-from datasets.experiment.recorded.outcome import injected, outcome_row
+from datasets.experiment.recorded.outcome import inject_fault, outcome_row
 from datasets.experiment.recorded.plan import Bank, PlannedFault, RecordedPlan, load_plan
 from datasets.faults import FaultKind, FaultSpec
 from datasets.inject import inject
@@ -49,7 +49,7 @@ def _processor_time(base: Baseline) -> list[Figure]:
     onsets = _drawn(base, load_plan(None).model_copy(update={"per_cell": _SAMPLE_PER_CELL}))
     begun = time.process_time()
     for onset in onsets:
-        outcome_row(base, onset, injected(base, onset))
+        outcome_row(base, onset, inject_fault(base, onset))
     each_s = (time.process_time() - begun) / len(onsets)
     return [Figure("processor time of an injection", each_s, "s", target=_TARGET_EACH_S)]
 
@@ -75,7 +75,7 @@ def _compared(scenario: Scenario) -> list[Figure]:
 
     differing = 0
     for onset in onsets:
-        found = injected(base, onset)
+        found = inject_fault(base, onset)
         differing += outcome_row(base, onset, found)["time_to_detect_s"] != from_the_start(onset, found.fault)
     name = f"T_D that differ from a replay from the start, of {len(onsets)}"
     return [Figure(name, differing, "injections", target=0)]
@@ -83,8 +83,8 @@ def _compared(scenario: Scenario) -> list[Figure]:
 
 def _drawn(base: Baseline, plan: RecordedPlan) -> list[Onset]:
     room = room_of([base], plan.quiet_s)
-    cells = [cell for cell in plan.cells(base.config.hazards.failure_limit_m) if room.takes(cell)]
-    return numbered(cells, onsets_of([room], cells, plan))
+    cells = [cell for cell in plan.cells(base.config.hazards.failure_limit_m) if room.takes_cell(cell)]
+    return number_onsets(cells, onsets_of([room], cells, plan))
 
 
 def _whole(folder: Path, base: Baseline) -> list[Figure]:

@@ -46,7 +46,7 @@ class Experiment:
         `recorded`: a result whose noise replaces the published one, which only `rare` takes. Raises `UsageError` where
         the experiment does not take what is given.
         """
-        from datasets.experiment.tables import write
+        from datasets.experiment.tables import write_contents
 
         place = f"experiment {self.name}"
         if config is not None and not self.configured:
@@ -58,7 +58,7 @@ class Experiment:
         count = repetitions or module.REPETITIONS
         settings = {"experiment": self.name, "repetitions": count, "seed": seed} | getattr(module, "SETTINGS", {})
         noise = {} if recorded is None else {"recorded": recorded}
-        return write(out, module.run(count, seed, jobs, config, **noise), settings)
+        return write_contents(out, module.run(count, seed, jobs, config, **noise), settings)
 
 
 EXPERIMENTS: dict[str, Experiment] = {

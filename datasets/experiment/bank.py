@@ -17,7 +17,7 @@ from scipy.linalg import solve_discrete_lyapunov
 from scipy.special import log_ndtr, ndtri_exp
 
 from datasets.experiment.geometry import SOURCES, TAUS_S, Geometry
-from datasets.experiment.sampling import Limits, root_of
+from datasets.experiment.sampling import Limits, matrix_root
 from schemas.arrays import Bools, Floats
 from schemas.config import MonitorConfig, threshold_factor
 from schemas.frozen import frozen
@@ -53,7 +53,7 @@ class BankSpec:
     age_s: float | None = None
 
     @classmethod
-    def of(cls, config: MonitorConfig, sensors: Sensors, rate_hz: float = 1.0) -> BankSpec:
+    def from_configuration(cls, config: MonitorConfig, sensors: Sensors, rate_hz: float = 1.0) -> BankSpec:
         """The bank of a replay's configuration; recorded odometers are noisy on increments."""
         return cls(
             alphas=(1.0, *config.ewma_alphas),
@@ -96,6 +96,7 @@ class LinearBank:
 
     @property
     def size(self) -> int:
+        """How many monitors there are."""
         return int(self.slope.size)
 
     @cached_property
@@ -146,16 +147,20 @@ class LinearBank:
         return rate_mps * np.asarray((1.0 - (1.0 - self.alpha) ** k) * self.slope)
 
     def limits(self, epochs: int, rate_mps: float) -> Limits:
+        """The thresholds, on the side that the ramp pushes to."""
         towards = np.where(self.slope < 0, -1.0, 1.0)
         return Limits(self.ramp(epochs, rate_mps), self.thresholds(epochs), self.sigmas(epochs), towards)
 
     def on_limits(self, values: Floats) -> Floats:
+        """What the limits bound: the values themselves."""
         return values
 
     def towards_limit(self, epochs: int) -> Callable[[int, int], Floats]:
+        """Covariance of the values with the monitor of a limit at an epoch, as a function of both."""
         return partial(self.covariance_with, covariances=self.covariances(epochs))
 
     def passing(self, epochs: int) -> Callable[[int, Floats], Bools]:
+        """Whether each run passes at an epoch with its values, as a function of both."""
         threshold = self.thresholds(epochs)
         return lambda k, values: np.asarray((np.abs(values) <= threshold[k][:, None]).all(axis=0))
 
@@ -180,7 +185,8 @@ class LinearBank:
             earlier = A.T @ earlier
         return result
 
-    def by_lag(self, epochs: int) -> Floats:
+    def covariance_by_lag(self, epochs: int) -> Floats:
+        """Covariance of value j at epoch k + lag with value i at k, lags -(n-1) .. n-1; (lags, i, j)."""
         if self.spec.age_s is not None:
             raise ValueError("false alarms are sampled of a stationary bank")
         result = np.empty((2 * epochs - 1, self.size, self.size))
@@ -191,7 +197,7 @@ class LinearBank:
             later = self.advance @ later
         return result
 
-    def forced(self, values: Floats, rng: np.random.Generator) -> tuple[Floats, float]:
+    def force_fail(self, values: Floats, rng: np.random.Generator) -> tuple[Floats, float]:
         """A monitor drawn at random beyond its threshold; the tail in logarithms does not underflow at 1e-15."""
         runs = len(values)
         sigma = self.sigma
@@ -204,18 +210,22 @@ class LinearBank:
         pull[each, monitor] = (target - values[each, monitor]) / sigma[monitor] ** 2
         return pull, self.size * 2.0 * float(np.exp(log_tail))
 
-    def fails(self, path: Floats) -> int:
+    def count_fails(self, path: Floats) -> int:
+        """Fails of one run, (epochs, values)."""
         return int((np.abs(path) > self.threshold).sum())
 
-    def start(self, runs: int, rng: np.random.Generator) -> Floats:
-        return np.asarray(root_of(self.covariances(0)[0]) @ rng.standard_normal((len(self.advance), runs)))
+    def draw_start(self, runs: int, rng: np.random.Generator) -> Floats:
+        """States at the fault's onset, (states, runs)."""
+        return np.asarray(matrix_root(self.covariances(0)[0]) @ rng.standard_normal((len(self.advance), runs)))
 
-    def following(self, state: Floats, rng: np.random.Generator) -> Floats:
+    def draw_next(self, state: Floats, rng: np.random.Generator) -> Floats:
+        """States at the next epoch, A x + B w."""
         following = self.advance @ state
         following += self.noise @ rng.standard_normal((self.noise.shape[1], state.shape[1]))
         return np.asarray(following)
 
     def values(self, state: Floats) -> Floats:
+        """Values of the monitors, (values, runs)."""
         return state[self.sources :]
 
 
@@ -227,7 +237,7 @@ def linear_bank(geometry: Geometry, heading_deg: float, spec: BankSpec) -> Linea
     vectors = geometry.axes(heading_deg)[: _MOST_AXES if spec.sensors == "odometer_and_track" else 1]
     covariances = np.einsum("ai,jik,bk->jab", vectors, geometry.source_covariances_m2, vectors)
     dt_s = 1.0 / spec.rate_hz
-    return _assemble(spec, covariances, np.exp(-dt_s / TAUS_S), vectors @ geometry.ramp_direction)
+    return _assemble_bank(spec, covariances, np.exp(-dt_s / TAUS_S), vectors @ geometry.ramp_direction)
 
 
 def bank_of_axis(spec: BankSpec, variances_m2: Floats, taus_s: Floats, white_m: float) -> LinearBank:
@@ -237,10 +247,10 @@ def bank_of_axis(spec: BankSpec, variances_m2: Floats, taus_s: Floats, white_m: 
     position.
     """
     covariances = variances_m2[:, None, None]
-    return _assemble(spec, covariances, np.exp(-1.0 / spec.rate_hz / taus_s), np.ones(1), white_m)
+    return _assemble_bank(spec, covariances, np.exp(-1.0 / spec.rate_hz / taus_s), np.ones(1), white_m)
 
 
-def _assemble(spec: BankSpec, covariances: Floats, phi: Floats, slope: Floats, white_m: float = 0.0) -> LinearBank:
+def _assemble_bank(spec: BankSpec, covariances: Floats, phi: Floats, slope: Floats, white_m: float = 0.0) -> LinearBank:
     """`covariances` (sources, axes, axes) [m2] of the position; `phi` (sources,) correlation of successive epochs."""
     count = slope.size
     gauss_markov = len(SOURCES) * count

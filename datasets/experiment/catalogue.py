@@ -121,7 +121,7 @@ def prepare_journey(plan: JourneyPlan, seed: int, rate_hz: float) -> PreparedJou
                 {"length_m": 600.0, "radius_m": -2_500.0},
             ],
             "elements": [{"id": f"NE{k:03}", "length_m": _ELEMENT_M} for k in range(int(length_m / _ELEMENT_M) + 2)],
-            "balises": [_balise(k, plan) for k in range(count)],
+            "balises": [_balise_spec(k, plan) for k in range(count)],
             "parallels": [
                 {"id": "BESIDE", "from_m": SPEED_MPS * (plan.onset_s - 100.0), "to_m": length_m, "left_m": 4.5}
             ],
@@ -132,19 +132,20 @@ def prepare_journey(plan: JourneyPlan, seed: int, rate_hz: float) -> PreparedJou
         },
         "odometer": {"rate_hz": 10.0},
         "reference": {"rate_hz": 1.0},
-        "runs": [{"id": "run", "motion": _motion(plan)}],
+        "runs": [{"id": "run", "motion": _motion_phases(plan)}],
     }
     scenario = Scenario.model_validate(spec)
     return PreparedJourney(plan, scenario, build_line(scenario.line))
 
 
-def _motion(plan: JourneyPlan) -> dict[str, object]:
+def _motion_phases(plan: JourneyPlan) -> dict[str, object]:
     """To speed within a minute, then steady."""
     steady_s = plan.span_s - 5.0 - SPEED_MPS / 0.5
     return {"start_m": 200.0, "phases": [{"speed_mps": SPEED_MPS, "acceleration_mps2": 0.5, "hold_s": steady_s}]}
 
 
-def _balise(number: int, plan: JourneyPlan) -> dict[str, object]:
+def _balise_spec(number: int, plan: JourneyPlan) -> dict[str, object]:
+    """One balise of the line, virtual or physical."""
     physical = plan.physical_every and number % plan.physical_every == plan.physical_every - 1
     name = f"{'PB' if physical else 'VB'}{number:03}"
     at_m = _FIRST_BALISE_M + _BALISES_EVERY_M * number
@@ -160,13 +161,13 @@ def with_fault(prepared: PreparedJourney, fault: CatalogueFault) -> tuple[RunLog
     run = build_run(scenario, spec, prepared.line)
     site = build_site(scenario, prepared.line)
     if prepared.plan.physical_every:
-        run = run.with_streams(balise_reads=_reads(prepared))
+        run = run.with_streams(balise_reads=_balise_reads(prepared))
     if fault.change is None:
         return run, site
     return fault.change(run, site, prepared.onset_ns, fault.size)
 
 
-def _reads(prepared: PreparedJourney) -> pl.DataFrame:
+def _balise_reads(prepared: PreparedJourney) -> pl.DataFrame:
     """When the antenna is over each physical balise."""
     motion = build_motion(prepared.scenario.runs[0].motion)
     end_m = float(motion.chainage_m(np.array([motion.duration_s]))[0])
@@ -195,14 +196,14 @@ def run_catalogue(
     """One row per fault and repetition, in the order of the catalogue; see `judged`."""
     journeys = dict.fromkeys(one.journey for one in faults)
     tasks = [(journey, number) for journey in journeys for number in range(repetitions)]
-    replayed = partial(_replayed, tuple(faults), seed, compared(config or Configuration()))
+    replayed = partial(_replay_faults, tuple(faults), seed, with_comparison(config or Configuration()))
     rows = [row for part in map_in_processes(replayed, tasks, jobs) for row in part]
     order = {one.name: place for place, one in enumerate(faults)}
     rows.sort(key=lambda row: (order[str(row["fault"])], row["repetition"]))
     return pl.DataFrame(rows, infer_schema_length=None, schema_overrides=_NULLABLE)
 
 
-def compared(config: Configuration) -> Configuration:
+def with_comparison(config: Configuration) -> Configuration:
     """The configuration with the two solutions compared, unless it names another one itself."""
     if config.monitors.channel_reference is not None:
         return config
@@ -210,7 +211,7 @@ def compared(config: Configuration) -> Configuration:
     return config.model_copy(update={"monitors": monitors})
 
 
-def _replayed(
+def _replay_faults(
     faults: tuple[CatalogueFault, ...], seed: int, config: Configuration, task: tuple[Journey, int]
 ) -> list[Row]:
     """One journey with one noise, and each of the faults that go into it."""
@@ -223,21 +224,21 @@ def _replayed(
         rows.append(
             {"fault": fault.name, "kind": fault.kind, "size": fault.size, "unit": fault.unit}
             | {"journey": journey, "repetition": number}
-            | judged(prepared, tables, None if fault.is_healthy else healthy, config)
+            | judge_replay(prepared, tables, None if fault.is_healthy else healthy, config)
         )
     return rows
 
 
-def judged(prepared: PreparedJourney, tables: RunTables, healthy: RunTables | None, config: Configuration) -> Row:
+def judge_replay(prepared: PreparedJourney, tables: RunTables, healthy: RunTables | None, config: Configuration) -> Row:
     """What one replay shows of the fault; times from its onset.
 
     `seen_s`: by monitor when it first failed; `first`: those that failed at the first of these epochs, the largest
     over its threshold first. Without a healthy replay every failure counts. `failure_s`: first epoch with an
     along-track error beyond the limit. `unsafe`: balises accepted beyond it.
     """
-    epochs = _from_onset(tables.epochs, prepared)
+    epochs = _epochs_from_onset(tables.epochs, prepared)
     without_fault = healthy.epochs if healthy is not None else tables.epochs.clear()
-    failed_s = _first_fails(epochs, _from_onset(without_fault, prepared))
+    failed_s = _first_fails(epochs, _epochs_from_onset(without_fault, prepared))
     detected_s = min(failed_s.values(), default=None)
     beyond = epochs.filter(pl.col("error_along_m").abs() > config.hazards.limits.failure_m)
     return {
@@ -245,15 +246,17 @@ def judged(prepared: PreparedJourney, tables: RunTables, healthy: RunTables | No
         "way_m": None if detected_s is None else _travelled_m(prepared, detected_s),
         "first": _failed_first(epochs, failed_s, detected_s),
         "failure_s": beyond["since_s"][0] if beyond.height else None,
-        "unsafe": _unsafe(tables, prepared, config) - (_unsafe(healthy, prepared, config) if healthy else 0),
-        "linking_errors": _linking_errors(tables) - (_linking_errors(healthy) if healthy else 0),
+        "unsafe": _count_unsafe(tables, prepared, config)
+        - (_count_unsafe(healthy, prepared, config) if healthy else 0),
+        "linking_errors": _count_linking_errors(tables) - (_count_linking_errors(healthy) if healthy else 0),
         "seen_s": [failed_s.get(monitor) for monitor in MONITORS],
         "budget_s": config.budget_s,
         "reaction_s": config.hazards.reaction_s if config.hazards.reaction_s is not None else 1.0 / RATE_HZ,
     }
 
 
-def _from_onset(epochs: pl.DataFrame, prepared: PreparedJourney) -> pl.DataFrame:
+def _epochs_from_onset(epochs: pl.DataFrame, prepared: PreparedJourney) -> pl.DataFrame:
+    """The epochs of the solution from the onset on, with the time since then."""
     since = (pl.col("t").dt.timestamp("ns") - prepared.onset_ns) / 1e9
     return epochs.filter(pl.col("solution") == _SOLUTION).with_columns(since_s=since).filter(pl.col("since_s") >= 0.0)
 
@@ -290,7 +293,7 @@ def _travelled_m(prepared: PreparedJourney, since_s: float) -> float:
     return float(at[1] - at[0])
 
 
-def _unsafe(tables: RunTables, prepared: PreparedJourney, config: Configuration) -> int:
+def _count_unsafe(tables: RunTables, prepared: PreparedJourney, config: Configuration) -> int:
     """Virtual balises accepted from the onset on with an error beyond the limit."""
     wrong = (pl.col("status") == "accepted") & (pl.col("location_error_m").abs() > config.hazards.limits.failure_m)
     return tables.passages.filter(
@@ -301,6 +304,7 @@ def _unsafe(tables: RunTables, prepared: PreparedJourney, config: Configuration)
     ).height
 
 
-def _linking_errors(tables: RunTables) -> int:
+def _count_linking_errors(tables: RunTables) -> int:
+    """Passages with a linking error."""
     ours = tables.passages.filter(pl.col("solution") == _SOLUTION)
     return ours.filter(pl.col("linking_error") != "none").height

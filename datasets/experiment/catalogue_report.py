@@ -5,7 +5,7 @@ from __future__ import annotations
 import polars as pl
 
 from datasets.experiment.catalogue_faults import HEALTHY
-from datasets.experiment.tables import Row, share, table
+from datasets.experiment.tables import Row, share_columns, table_of_rows
 from schemas.monitors import MONITORS, OTHER_MONITORS
 
 _HEAD = (
@@ -16,7 +16,7 @@ _HEAD = (
 
 def faults_table(runs: pl.DataFrame) -> pl.DataFrame:
     """One row per fault, in the order of the runs."""
-    return table([_fault_row(part) for part in runs.partition_by("fault", maintain_order=True)])
+    return table_of_rows([_fault_row(part) for part in runs.partition_by("fault", maintain_order=True)])
 
 
 def _fault_row(runs: pl.DataFrame) -> Row:
@@ -26,11 +26,11 @@ def _fault_row(runs: pl.DataFrame) -> Row:
     missed = failed.filter(~(pl.col("detected_s") <= pl.col("failure_s")).fill_null(False)).height
     negated_s = pl.col("detected_s") + pl.col("reaction_s")
     in_time = failed.filter((negated_s <= pl.col("failure_s") + pl.col("budget_s")).fill_null(False)).height
-    first = _ranking(found)
+    first = _rank_monitors(found)
     return {
         **{name: runs[name][0] for name in ("fault", "kind", "size", "unit", "journey")},
         "runs": runs.height,
-        **share("detected", found.height, runs.height),
+        **share_columns("detected", found.height, runs.height),
         "first_monitor": first[0][0] if first else None,
         "first_monitors": ", ".join(f"{name} {part:.0%}" for name, part in first),
         "time_to_detect_median_s": found["detected_s"].median(),
@@ -40,15 +40,15 @@ def _fault_row(runs: pl.DataFrame) -> Row:
         "failed": failed.height,
         "failure_median_s": failed["failure_s"].median(),
         "missed_at_failure": missed,
-        **share("pmd_at_failure", missed, failed.height),
-        **share("within_budget", in_time, failed.height),
+        **share_columns("pmd_at_failure", missed, failed.height),
+        **share_columns("within_budget", in_time, failed.height),
         "runs_with_unsafe": runs.filter(pl.col("unsafe") > 0).height,
         "unsafe_accepted": int(runs["unsafe"].clip(lower_bound=0).sum()),
         "seen_by_linking_alone": runs.filter(pl.col("detected_s").is_null() & (pl.col("linking_errors") > 0)).height,
     }
 
 
-def _ranking(found: pl.DataFrame) -> list[tuple[str, float]]:
+def _rank_monitors(found: pl.DataFrame) -> list[tuple[str, float]]:
     """Monitors by the share of detections in which they failed first, or with the largest value of those that did."""
     leading = found.select(monitor=pl.col("first").list.first())
     counted = leading.group_by("monitor").len().sort(["len", "monitor"], descending=[True, False])
@@ -91,7 +91,7 @@ def _monitor_row(monitor: str, place: int, runs: list[list[float | None]]) -> Ro
     return {
         "monitor": monitor,
         "runs": len(runs),
-        **share("seen", len(own), len(runs)),
+        **share_columns("seen", len(own), len(runs)),
         "first": first / len(runs),
         "ahead": (len(leads) + alone) / len(runs),
         "alone": alone / len(runs),
@@ -122,7 +122,7 @@ def catalogue_page(faults: pl.DataFrame, monitors: pl.DataFrame) -> str:
         "virtual balise was accepted with an error beyond the limit.",
         "",
         *_HEAD,
-        *(_row(row) for row in real.iter_rows(named=True)),
+        *(_table_line(row) for row in real.iter_rows(named=True)),
         "",
         "## What no monitor sees in most replays",
         "",
@@ -130,75 +130,85 @@ def catalogue_page(faults: pl.DataFrame, monitors: pl.DataFrame) -> str:
         "",
         "## What each monitor beyond the bank of averages is for",
         "",
-        *(_purpose(name, monitors) for name in OTHER_MONITORS),
+        *(_purpose_words(name, monitors) for name in OTHER_MONITORS),
         "",
         "## Healthy journeys",
         "",
         "What fails here fails without a fault, and counts as no detection above.",
         "",
-        *(_healthy(row) for row in faults.filter(pl.col("kind").str.starts_with(HEALTHY)).iter_rows(named=True)),
+        *(_healthy_line(row) for row in faults.filter(pl.col("kind").str.starts_with(HEALTHY)).iter_rows(named=True)),
     ]
     return "\n".join(lines) + "\n"
 
 
-def _row(row: dict[str, object]) -> str:
+def _table_line(row: dict[str, object]) -> str:
+    """A fault as a line of the table."""
     cells = (
         row["fault"],
-        _seconds(row["failure_median_s"]),
+        _seconds_words(row["failure_median_s"]),
         row["first_monitors"] or "-",
-        _seconds(row["time_to_detect_median_s"]),
-        _metres(row["way_median_m"]),
-        _percent(row["detected"]),
-        _pmd(row),
+        _seconds_words(row["time_to_detect_median_s"]),
+        _metres_words(row["way_median_m"]),
+        _percent_words(row["detected"]),
+        _pmd_words(row),
         f"{row['runs_with_unsafe']}",
     )
     return "| " + " | ".join(str(cell) for cell in cells) + " |"
 
 
-def _pmd(row: dict[str, object]) -> str:
+def _pmd_words(row: dict[str, object]) -> str:
+    """Missed at the failure, of how many, with bounds."""
     if not row["failed"]:
         return "-"
-    bounds = f"{_percent(row['pmd_at_failure_low'])} to {_percent(row['pmd_at_failure_high'])}"
+    bounds = f"{_percent_words(row['pmd_at_failure_low'])} to {_percent_words(row['pmd_at_failure_high'])}"
     return f"{row['missed_at_failure']} of {row['failed']} ({bounds})"
 
 
-def _seconds(value: object) -> str:
+def _seconds_words(value: object) -> str:
+    """A time in words."""
     return "-" if value is None else f"{value:.0f} s"
 
 
-def _metres(value: object) -> str:
+def _metres_words(value: object) -> str:
+    """A distance in words."""
     return "-" if value is None else f"{value:.0f} m"
 
 
-def _percent(value: object) -> str:
+def _percent_words(value: object) -> str:
+    """A share in words."""
     return "-" if value is None else f"{value:.1%}"
 
 
 def _undetected_lines(faults: pl.DataFrame) -> list[str]:
+    """Lines on faults that fewer than half of the replays detected."""
     lines = []
     for row in faults.filter(pl.col("detected") < 0.5).iter_rows(named=True):
         harm = f"unsafe in {row['runs_with_unsafe']} of {row['runs']}" if row["runs_with_unsafe"] else "nothing unsafe"
         linking = ", linking errors tell" if row["seen_by_linking_alone"] * 2 > row["runs"] else ""
-        share = f", seen in {_percent(row['detected'])}" if row["detected"] else ""
+        share = f", seen in {_percent_words(row['detected'])}" if row["detected"] else ""
         lines.append(f"- {row['fault']}: {harm}{linking}{share}")
     return lines or ["- nothing"]
 
 
-def _purpose(monitor: str, monitors: pl.DataFrame) -> str:
+def _purpose_words(monitor: str, monitors: pl.DataFrame) -> str:
     """Faults that it sees before all others, or alone, in most replays; else those that it is among the first for."""
     own = monitors.filter(pl.col("monitor") == monitor)
     ahead = own.filter(pl.col("ahead") >= 0.5)
     if ahead.height:
-        return f"- `{monitor}`: before all others for {'; '.join(_leads(row) for row in ahead.iter_rows(named=True))}"
+        return (
+            f"- `{monitor}`: before all others for {'; '.join(_lead_words(row) for row in ahead.iter_rows(named=True))}"
+        )
     among = own.filter(pl.col("first") >= 0.5)["fault"].to_list()
     return f"- `{monitor}`: among the first for {'; '.join(among) or 'nothing'}"
 
 
-def _leads(row: dict[str, object]) -> str:
-    lead = "alone" if row["lead_s"] is None else f"by {_seconds(row['lead_s'])}"
-    return f"{row['fault']} ({_percent(row['ahead'])}, {lead})"
+def _lead_words(row: dict[str, object]) -> str:
+    """A fault that a monitor sees first, how often, and by how much."""
+    lead = "alone" if row["lead_s"] is None else f"by {_seconds_words(row['lead_s'])}"
+    return f"{row['fault']} ({_percent_words(row['ahead'])}, {lead})"
 
 
-def _healthy(row: dict[str, object]) -> str:
+def _healthy_line(row: dict[str, object]) -> str:
+    """A line on journeys without a fault."""
     first = f", first {row['first_monitors']}" if row["first_monitors"] else ""
-    return f"- {row['kind']}: some monitor failed in {_percent(row['detected'])} of {row['runs']} replays{first}"
+    return f"- {row['kind']}: some monitor failed in {_percent_words(row['detected'])} of {row['runs']} replays{first}"

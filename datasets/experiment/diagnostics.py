@@ -24,7 +24,7 @@ from datasets.experiment.monte_carlo import (
     failure_forms,
     first_passages,
 )
-from datasets.experiment.tables import Contents, Row, share, table, time_columns
+from datasets.experiment.tables import Contents, Row, share_columns, table_of_rows, time_columns
 from datasets.experiment.workers import in_pieces
 from schemas.arrays import Bools, Ints
 from schemas.config import Configuration
@@ -49,7 +49,9 @@ def run_diagnostics(repetitions: int = REPETITIONS, seed: int = 1, jobs: int = 1
     plans = tuple(ExperimentPlan(default_geometry(constellation)) for constellation in CONSTELLATIONS)
     pairs = list(zip(plans, simulate(plans, repetitions, seed, jobs), strict=True))
     return {
-        "pmd": table([row for plan, found in pairs for cell in _cells(plan, found) for row in _pmd_rows(plan, cell)]),
+        "pmd": table_of_rows(
+            [row for plan, found in pairs for cell in _rate_answers(plan, found) for row in _pmd_rows(plan, cell)]
+        ),
         "detection": pl.concat([detection_times(plan, found) for plan, found in pairs]),
         "geometry": pl.concat([geometry_table(plan.geometry) for plan in plans]),
     }
@@ -67,7 +69,7 @@ def simulate(plans: tuple[ExperimentPlan, ...], repetitions: int, seed: int, job
 
 def detection_times(plan: ExperimentPlan, passages: FirstPassages) -> pl.DataFrame:
     """Expected times of detection by question and rate (Fig. 6 and 7), shares detected and missed at failure."""
-    return table([_detection_row(plan, cell) for cell in _cells(plan, passages)])
+    return table_of_rows([_detection_row(plan, cell) for cell in _rate_answers(plan, passages)])
 
 
 @frozen
@@ -82,7 +84,8 @@ class _RateAnswers:
     alarmed_before: int
 
 
-def _cells(plan: ExperimentPlan, passages: FirstPassages) -> Iterator[_RateAnswers]:
+def _rate_answers(plan: ExperimentPlan, passages: FirstPassages) -> Iterator[_RateAnswers]:
+    """Every question at every rate, with the times of detection and failure."""
     end_s = plan.span_s - plan.onset_s
     for index, (reading, heading, sensors) in enumerate(plan.questions):
         for rate, rate_mps in enumerate(plan.rates_mps):
@@ -113,10 +116,11 @@ def _pmd_rows(plan: ExperimentPlan, cell: _RateAnswers) -> Iterator[Row]:
     for time_s in np.union1d(times, [0]):
         missed = int((lateness > time_s).sum())
         counts = {"time_since_failure_s": float(time_s), "missed": missed, "trials": trials}
-        yield cell.labels | counts | share("pmd", missed, trials)
+        yield cell.labels | counts | share_columns("pmd", missed, trials)
 
 
 def _detection_row(plan: ExperimentPlan, cell: _RateAnswers) -> Row:
+    """Times of detection and shares missed of one question at one rate."""
     end_s = float(plan.span_s - plan.onset_s)
     repetitions = cell.detected.size
     trials = int(cell.failed.sum())
@@ -127,12 +131,12 @@ def _detection_row(plan: ExperimentPlan, cell: _RateAnswers) -> Row:
         **cell.labels,
         "repetitions": repetitions,
         "censored": repetitions - detected,
-        **share("detected", detected, repetitions),
+        **share_columns("detected", detected, repetitions),
         **time_columns("time_to_detect", cell.detected_s.astype(np.float64), 0.0, end_s),
         "failed": trials,
         **time_columns("time_since_failure", since.astype(np.float64), -end_s, end_s),
-        **share("pmd_at_failure", missed, trials),
-        **share("alarmed_before", cell.alarmed_before, repetitions),
+        **share_columns("pmd_at_failure", missed, trials),
+        **share_columns("alarmed_before", cell.alarmed_before, repetitions),
     }
 
 

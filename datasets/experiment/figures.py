@@ -45,7 +45,8 @@ def drawn_figures(pmd: pl.DataFrame, detection: pl.DataFrame, geometry: pl.DataF
     return {f"{name}.svg": drawing for name, drawing in drawn.items()}
 
 
-def _points(frame: pl.DataFrame, *columns: str) -> list[tuple[float, float]]:
+def _known_points(frame: pl.DataFrame, *columns: str) -> list[tuple[float, float]]:
+    """Points of a curve that are known."""
     return list(frame.select(columns).drop_nulls().iter_rows())
 
 
@@ -61,26 +62,28 @@ def pmd_plot(title: str, curves: Sequence[Curve]) -> str:
 
 
 def _pmd_figure(pmd: pl.DataFrame, reading: str) -> str:
+    """Pmd over the time since failure, heading 0, by constellation and rate (DIAG Fig. 5)."""
     ahead = pmd.filter(reading=reading, sensors="odometer", heading_deg=0.0)
     curves = []
     for constellation, (number, rate) in product(CONSTELLATIONS, enumerate(_PMD_RATES_MPS)):
         chosen = ahead.filter(constellation=constellation, rate_mps=rate)
         curve = Curve(
             f"{_NAMES[constellation]}, {rate:g} m/s",
-            _points(chosen, "time_since_failure_s", "pmd"),
+            _known_points(chosen, "time_since_failure_s", "pmd"),
             COLOURS[number],
             dashed=constellation != "gps",
-            band=_points(chosen, "pmd_low", "pmd_high"),
+            band=_known_points(chosen, "pmd_low", "pmd_high"),
         )
         curves.append(curve)
     return pmd_plot(f"Pmd over the time since failure: heading 0, odometer only, noise on {reading}", curves)
 
 
 def _time_figure(detection: pl.DataFrame, reading: str, constellation: str) -> str:
+    """Expected time to detect over the heading (DIAG Fig. 6)."""
     curves = []
     for (number, rate), sensors in product(enumerate(_DETECT_RATES_MPS), SENSORS):
         chosen = detection.filter(reading=reading, constellation=constellation, sensors=sensors, rate_mps=rate)
-        line = _points(chosen, "heading_deg", "time_to_detect_s")
+        line = _known_points(chosen, "heading_deg", "time_to_detect_s")
         name = f"{rate:g} m/s, {_SENSOR_NAMES[sensors]}"
         curves.append(Curve(name, line, COLOURS[number], dashed=sensors == "odometer"))
     title = f"Expected time to detect over heading: {_NAMES[constellation]}, noise on {reading}"
@@ -88,14 +91,17 @@ def _time_figure(detection: pl.DataFrame, reading: str, constellation: str) -> s
 
 
 def _since_figure(detection: pl.DataFrame, rate_mps: float) -> str:
+    """Expected time since failure over the heading (DIAG Fig. 7)."""
     value, low, high = "time_since_failure_s", "time_since_failure_low_s", "time_since_failure_high_s"
     known = detection.filter(sensors="odometer_and_track", rate_mps=rate_mps).drop_nulls(value)
     curves = []
     for (number, constellation), reading in product(enumerate(CONSTELLATIONS), READINGS):
         chosen = known.filter(reading=reading, constellation=constellation)
         name = f"{_NAMES[constellation]}, {reading}"
-        band = _points(chosen, low, high)
-        curves.append(Curve(name, _points(chosen, "heading_deg", value), COLOURS[number], reading == "position", band))
+        band = _known_points(chosen, low, high)
+        curves.append(
+            Curve(name, _known_points(chosen, "heading_deg", value), COLOURS[number], reading == "position", band)
+        )
     ends = (0.0, *known[low].to_list(), *known[high].to_list())
     times = Axis("expected T_dsf [s]", min(ends), max(1.0, *ends), even_ticks(min(ends), max(1.0, *ends)))
     return plot(f"Expected time since failure over heading, with track, {rate_mps:g} m/s", _HEADINGS, times, curves)

@@ -121,7 +121,7 @@ def failure_forms(plan: ExperimentPlan) -> Forms:
     slope = np.zeros(count)
     for index, heading in enumerate(plan.headings_deg):
         along = plan.geometry.axes(heading)[0]
-        towards = _towards(along @ plan.geometry.ramp_direction)
+        towards = _sign_of(along @ plan.geometry.ramp_direction)
         rows[index, -2:] = towards * along[:2]
         slope[index] = towards * (along @ plan.geometry.ramp_direction)
     return Forms(
@@ -144,7 +144,8 @@ class _Form:
     members: list[bool]
 
 
-def _towards(slope: float) -> float:
+def _sign_of(slope: float) -> float:
+    """-1 for a negative slope, else +1."""
     return -1.0 if slope < 0 else 1.0
 
 
@@ -154,7 +155,7 @@ def _forms_along(plan: ExperimentPlan, heading: float, reading: Reading) -> list
     signals = {"east": axis[0], "north": axis[1], f"odometer_{reading}": -plan.odometer_m}
     answers = [(r, h) == (reading, heading) for r, h, _ in plan.questions]
     spec = BankSpec(reading=reading, odometer_m=plan.odometer_m, age_s=0.0)
-    return _forms(plan, axis, spec, 0.0, signals, [answers] * len(spec.weights))
+    return _forms_by_weight(plan, axis, spec, 0.0, signals, [answers] * len(spec.weights))
 
 
 def _forms_against_map(
@@ -169,10 +170,10 @@ def _forms_against_map(
         ]
         for alpha in spec.weights
     ]
-    return _forms(plan, axis, spec, plan.map_m, signals, members)
+    return _forms_by_weight(plan, axis, spec, plan.map_m, signals, members)
 
 
-def _forms(
+def _forms_by_weight(
     plan: ExperimentPlan,
     axis: Floats,
     spec: BankSpec,
@@ -192,7 +193,7 @@ def _forms(
         index = int(np.flatnonzero(plan.alphas == weight)[0])
         row = np.zeros(plan.basis_size)
         for signal, factor in signals.items():
-            row[index * len(SIGNALS) + SIGNALS.index(signal)] = factor * _towards(slope)
+            row[index * len(SIGNALS) + SIGNALS.index(signal)] = factor * _sign_of(slope)
         forms.append(_Form(row, index, sigma_mps, abs(slope), answers))
     return forms
 
@@ -250,7 +251,7 @@ class NoisePaths:
         self._unit = before.copy()
         basis = self._basis[:epochs]
         self._signals(normals, basis)
-        self._filter(basis)
+        self._filter_signals(basis)
         return basis
 
     def _signals(self, normals: Floats, basis: Floats) -> None:
@@ -269,7 +270,8 @@ class NoisePaths:
         self._position = position[-1].copy()
         self._white = white[-1].copy()
 
-    def _filter(self, basis: Floats) -> None:
+    def _filter_signals(self, basis: Floats) -> None:
+        """Run the averages over the signals of a block, into the basis."""
         signals = basis[:, : len(SIGNALS)]
         rows = basis[:, len(SIGNALS) : -2].reshape(len(basis), -1, len(SIGNALS), basis.shape[2])
         before = self._ewma
@@ -339,9 +341,11 @@ class FirstAnswers:
                 forms = asked[possible.any(axis=1)]
                 terms = np.flatnonzero(self._rows[forms].any(axis=0))
                 values = np.matmul(self._rows[np.ix_(forms, terms)], basis[:, terms[:, None], runs])
-                self._note(question, runs, values, threshold[:, forms, None], response[:, forms, None], begin)
+                self._note_answers(question, runs, values, threshold[:, forms, None], response[:, forms, None], begin)
 
-    def _note(self, question: int, runs: Ints, values: Floats, threshold: Floats, response: Floats, begin: int) -> None:
+    def _note_answers(
+        self, question: int, runs: Ints, values: Floats, threshold: Floats, response: Floats, begin: int
+    ) -> None:
         """When each rate, if still open, is first answered; `values` (epochs, forms, runs)."""
         # The smallest rate at which a form fails with the ramp; against it, -m > T + c b: a false alarm, likelier for
         # the slower ramp.
@@ -368,15 +372,15 @@ def first_passages(
     """Simulate `repetitions` runs of the plan and answer all of its questions."""
     paths = NoisePaths(plan, repetitions, rng)
     answers = FirstAnswers(plan, banks, failures, paths.weights, repetitions)
-    for begin, end in _blocks(0, plan.onset_s):
+    for begin, end in _growing_blocks(0, plan.onset_s):
         answers.before_onset(paths.advance(end - begin), begin)
-    for begin, end in _blocks(plan.onset_s, plan.span_s, _FIRST_BLOCK):
+    for begin, end in _growing_blocks(plan.onset_s, plan.span_s, _FIRST_BLOCK):
         answers.after_onset(paths.advance(end - begin), begin)
     questions = banks.members.shape[0]
     return FirstPassages(answers.first[:questions], answers.first[questions:], answers.alarmed)
 
 
-def _blocks(begin: int, end: int, shortest: int = BLOCK_EPOCHS) -> Iterator[tuple[int, int]]:
+def _growing_blocks(begin: int, end: int, shortest: int = BLOCK_EPOCHS) -> Iterator[tuple[int, int]]:
     """Blocks that grow with the time since `begin`: passages of fast ramps crowd at the onset."""
     at = begin
     while at < end:

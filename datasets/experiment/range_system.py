@@ -17,7 +17,7 @@ import numpy as np
 from scipy.special import chdtr, chdtri
 
 from datasets.experiment.geometry import TAUS_S, Geometry
-from datasets.experiment.sampling import Limits, root_of
+from datasets.experiment.sampling import Limits, matrix_root
 from pipeline.stages.monitors.pseudorange import clock_columns, line_of_sight_rows
 from schemas.arrays import Bools, Floats
 from schemas.frozen import frozen
@@ -46,7 +46,7 @@ class Statistic(NamedTuple):
     threshold: float
 
 
-def statistic(plan: RangePlan, heading_deg: float) -> Statistic:
+def monitor_statistic(plan: RangePlan, heading_deg: float) -> Statistic:
     """The monitor of `pipeline.stages.monitors.pseudorange` for a fixed sky and heading, as one projection.
 
     Ranges have covariance V = diag(sigma^2) + survey^2 (g_c g_c' + g_u g_u'); along and clocks are free.
@@ -54,7 +54,7 @@ def statistic(plan: RangePlan, heading_deg: float) -> Statistic:
     geometry = plan.geometry
     rows = line_of_sight_rows(geometry.azimuth_deg, geometry.elevation_deg)
     axes = geometry.axes(heading_deg)
-    held = held_rows(plan, heading_deg)
+    held = survey_rows(plan, heading_deg)
     covariance = np.diag(geometry.range_variance_m2.sum(axis=1)) + plan.survey_m**2 * held @ held.T
     whiten = np.linalg.inv(np.linalg.cholesky(covariance))
     free = whiten @ np.column_stack([rows @ axes[0], clock_columns(geometry.svs)])
@@ -63,7 +63,7 @@ def statistic(plan: RangePlan, heading_deg: float) -> Statistic:
     return Statistic(kept @ whiten, float(chdtri(kept.shape[0], plan.false_alarm_probability)))
 
 
-def held_rows(plan: RangePlan, heading_deg: float) -> Floats:
+def survey_rows(plan: RangePlan, heading_deg: float) -> Floats:
     """Range change per metre of survey error across and in height, shape (satellites, 2)."""
     rows = line_of_sight_rows(plan.geometry.azimuth_deg, plan.geometry.elevation_deg)
     return np.asarray(rows @ plan.geometry.axes(heading_deg)[1:].T)
@@ -90,28 +90,34 @@ class RangeSystem:
 
     @property
     def size(self) -> int:
+        """Dimensions of the whitened residuals."""
         return int(self.metre.size)
 
-    def by_lag(self, epochs: int) -> Floats:
+    def covariance_by_lag(self, epochs: int) -> Floats:
+        """Covariance of residual j at epoch k + lag with residual i at k; (lags, i, j)."""
         share = self.phi[None, :] ** np.abs(np.arange(-epochs + 1, epochs))[:, None]
         return np.asarray(np.einsum("ls,sij->lij", share, self.covariance) + self.survey)
 
-    def start(self, runs: int, rng: np.random.Generator) -> Floats:
+    def draw_start(self, runs: int, rng: np.random.Generator) -> Floats:
         """States at the onset: sources, then the survey, d rows each; (states, runs)."""
-        parts = [root_of(one) @ rng.standard_normal((self.size, runs)) for one in (*self.covariance, self.survey)]
+        parts = [matrix_root(one) @ rng.standard_normal((self.size, runs)) for one in (*self.covariance, self.survey)]
         return np.concatenate(parts)
 
-    def following(self, state: Floats, rng: np.random.Generator) -> Floats:
+    def draw_next(self, state: Floats, rng: np.random.Generator) -> Floats:
+        """States at the next epoch; the survey's error stays."""
         sources = len(self.phi)
         moving = state.reshape(sources + 1, self.size, -1).copy()
         fresh = rng.standard_normal((sources, self.size, state.shape[1]))
-        moving[:sources] = self.phi[:, None, None] * moving[:sources] + self._push @ fresh
+        moving[:sources] = self.phi[:, None, None] * moving[:sources] + self._driving_matrices @ fresh
         result: Floats = moving.reshape(state.shape)
         return result
 
     @cached_property
-    def _push(self) -> Floats:
-        push: Floats = np.sqrt(1.0 - self.phi**2)[:, None, None] * np.array([root_of(one) for one in self.covariance])
+    def _driving_matrices(self) -> Floats:
+        """What turns normals into the change of each source over an epoch, (sources, d, d)."""
+        push: Floats = np.sqrt(1.0 - self.phi**2)[:, None, None] * np.array(
+            [matrix_root(one) for one in self.covariance]
+        )
         return push
 
     def values(self, state: Floats) -> Floats:
@@ -119,6 +125,7 @@ class RangeSystem:
         return np.asarray(state.reshape(-1, self.size, state.shape[1]).sum(axis=0))
 
     def ramp(self, epochs: int, rate_mps: float) -> Floats:
+        """What a range ramp adds to the residuals at epochs 1 .. n, (epochs, d)."""
         return np.asarray((rate_mps * self.period_s * np.arange(1, epochs + 1))[:, None] * self.metre)
 
     def limits(self, epochs: int, rate_mps: float) -> Limits:
@@ -128,36 +135,41 @@ class RangeSystem:
         return Limits(self.on_limits(self.ramp(epochs, rate_mps)), radius * one, one, np.ones(1))
 
     def on_limits(self, values: Floats) -> Floats:
-        return np.asarray(values @ self._along)[..., None]
+        """The component of the residuals along the ramp."""
+        return np.asarray(values @ self._ramp_direction)[..., None]
 
     @cached_property
-    def _along(self) -> Floats:
+    def _ramp_direction(self) -> Floats:
+        """Unit vector of the ramp among the residuals, (d,)."""
         return np.asarray(self.metre / np.sqrt(self.metre @ self.metre))
 
     def towards_limit(self, epochs: int) -> Callable[[int, int], Floats]:
-        towards = self.by_lag(epochs) @ self._along
+        """Covariance of the residuals with the limit at an epoch, as a function of both."""
+        towards = self.covariance_by_lag(epochs) @ self._ramp_direction
         return lambda _, epoch: np.asarray(towards[epochs - epoch : 2 * epochs - epoch])
 
     def passing(self, epochs: int) -> Callable[[int, Floats], Bools]:
+        """Whether each run passes with its residuals: |z|^2 is within the threshold."""
         return lambda _, values: np.asarray(np.square(values).sum(axis=0) <= self.threshold)
 
-    def forced(self, values: Floats, rng: np.random.Generator) -> tuple[Floats, float]:
+    def force_fail(self, values: Floats, rng: np.random.Generator) -> tuple[Floats, float]:
         """|z|^2 beyond the threshold by inversion of the tail; the direction of a healthy z is uniform."""
         probability = float(1.0 - chdtr(self.size, self.threshold))
         radius = np.sqrt(chdtri(self.size, probability * rng.random(len(values))))
         direction = rng.standard_normal((self.size, len(values)))
         return (radius * direction / np.sqrt(np.square(direction).sum(axis=0))).T - values, probability
 
-    def fails(self, path: Floats) -> int:
+    def count_fails(self, path: Floats) -> int:
+        """Fails of one run, (epochs, d)."""
         return int((np.square(path).sum(axis=1) > self.threshold).sum())
 
 
 def range_system(plan: RangePlan, heading_deg: float) -> RangeSystem:
     """The monitor of a plan at a heading, as `statistic` has it."""
-    one = statistic(plan, heading_deg)
+    one = monitor_statistic(plan, heading_deg)
     scaled = one.project[:, None, :] * np.sqrt(plan.geometry.range_variance_m2).T[None]
     covariance = np.einsum("asn,bsn->sab", scaled, scaled)
-    held = plan.survey_m * one.project @ held_rows(plan, heading_deg)
+    held = plan.survey_m * one.project @ survey_rows(plan, heading_deg)
     metre = one.project[:, plan.geometry.faulty]
     return RangeSystem(covariance, held @ held.T, np.exp(-plan.period_s / TAUS_S), metre, one.threshold, plan.period_s)
 

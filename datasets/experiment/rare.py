@@ -23,11 +23,11 @@ from datasets.experiment.sampling import (
     SMALLEST,
     System,
     false_alarm_probability,
-    figures,
     first_below,
     missed_detection_probability,
+    probability_figures,
 )
-from datasets.experiment.tables import Contents, Row, table
+from datasets.experiment.tables import Contents, Row, table_of_rows
 from pipeline.results.store import read_config, read_table
 from pipeline.stages.monitors.axis import error_model
 from schemas.config import Configuration, threshold_factor
@@ -64,7 +64,7 @@ def run(
     With `recorded`, a replayed result: `noise` (what was taken from it), `missed`, `false_alarms` of each solution.
     """
     if recorded is not None:
-        return _on_recorded_noise(recorded, repetitions, seed, jobs, config)
+        return _tables_on_recorded_noise(recorded, repetitions, seed, jobs, config)
     return {
         "missed": missed_table(repetitions, seed, jobs, config),
         "transients": transient_table(repetitions, seed, jobs, config),
@@ -79,7 +79,7 @@ def banks(config: Configuration | None, rate_hz: float = 1.0) -> Iterator[_Bank]
         for sensors in SENSORS:
             specs = [BankSpec(reading=reading, sensors=sensors, rate_hz=rate_hz) for reading in READINGS]
             if config is not None:
-                specs = [BankSpec.of(config.monitors, sensors, rate_hz)]
+                specs = [BankSpec.from_configuration(config.monitors, sensors, rate_hz)]
             for spec in specs:
                 yield constellation, linear_bank(default_geometry(constellation), 0.0, spec)
 
@@ -113,23 +113,28 @@ def miss_figures(
     targets = [f"{target:g}" for target in TARGETS]
     for reason, epochs in [("failure", at_failure), *zip(targets, found, strict=True)]:
         if epochs is not None:
-            yield reason, epochs, figures(missed_detection_probability(system, epochs, rate_mps, runs, seed, jobs))
+            yield (
+                reason,
+                epochs,
+                probability_figures(missed_detection_probability(system, epochs, rate_mps, runs, seed, jobs)),
+            )
 
 
 def missed_table(runs: int, seed: int, jobs: int, config: Configuration | None) -> pl.DataFrame:
     """Pmd at the mean failure, and the time that makes it as rare as each target, with the error of the estimate."""
     asked = [(one, rate) for one in banks(config) for rate in _RATES_MPS]
     # At 10 Hz the faster ramps of GPS, since slow ones differ little from 1 Hz.
-    asked += [(one, rate) for one in _fast(config) for rate in _RATES_MPS if rate >= _SLOWEST_AT_FAST_MPS]
+    asked += [(one, rate) for one in _fast_banks(config) for rate in _RATES_MPS if rate >= _SLOWEST_AT_FAST_MPS]
     rows: list[Row] = []
     for (constellation, bank), rate in asked:
         period_s = 1.0 / bank.spec.rate_hz
         for reason, epochs, found in miss_figures(bank, rate, failure_epoch(bank, rate), period_s, runs, seed, jobs):
             rows.append(_missed_row(constellation, bank, rate, epochs, reason) | found)
-    return table(rows)
+    return table_of_rows(rows)
 
 
-def _fast(config: Configuration | None) -> list[_Bank]:
+def _fast_banks(config: Configuration | None) -> list[_Bank]:
+    """Banks of GPS alone at the fast rate."""
     return [one for one in banks(config, _FAST_HZ) if one[0] == "gps"]
 
 
@@ -145,6 +150,7 @@ def _missed_row(constellation: Constellation, bank: LinearBank, rate: float, epo
 
 
 def _bank_row(constellation: Constellation, spec: BankSpec) -> Row:
+    """What names a bank in a table."""
     return {
         "constellation": constellation,
         "reading": spec.reading,
@@ -167,27 +173,27 @@ def transient_table(runs: int, seed: int, jobs: int, config: Configuration | Non
                 young = linear_bank(default_geometry(constellation), 0.0, replace(bank.spec, age_s=age_s))
                 missed = missed_detection_probability(young, epochs or 0, rate, runs, seed, jobs)
                 row = _missed_row(constellation, young, rate, epochs or 0, "transient")
-                rows.append({"age_s": age_s, **row, **figures(missed)})
-    return table(rows)
+                rows.append({"age_s": age_s, **row, **probability_figures(missed)})
+    return table_of_rows(rows)
 
 
 def alarm_table(runs: int, seed: int, jobs: int, config: Configuration | None) -> pl.DataFrame:
     """Probability that a healthy bank alarms at least once within an hour."""
     rows: list[Row] = []
-    for constellation, bank in [*banks(config), *_fast(config)]:
+    for constellation, bank in [*banks(config), *_fast_banks(config)]:
         asked = {"false_alarm_probability": bank.spec.false_alarm_probability, "horizon_s": HOUR_S}
         found = alarm_figures(bank, int(HOUR_S * bank.spec.rate_hz), runs, seed, jobs)
         rows.append(_bank_row(constellation, bank.spec) | asked | found)
-    return table(rows)
+    return table_of_rows(rows)
 
 
 def alarm_figures(system: System, epochs: int, runs: int, seed: int, jobs: int) -> Row:
     """Figures of at least one alarm in so many epochs; a share of the `runs` suffices."""
-    return figures(false_alarm_probability(system, epochs, max(runs // _ALARM_SHARE, 20), seed, jobs))
+    return probability_figures(false_alarm_probability(system, epochs, max(runs // _ALARM_SHARE, 20), seed, jobs))
 
 
 def range_table(runs: int, seed: int, jobs: int, config: Configuration | None) -> pl.DataFrame:
-    """The same of the pseudorange monitor, heading 0: misses, and alarms within an hour."""
+    """Misses of the pseudorange monitor, heading 0, and its alarms within an hour."""
     rows: list[Row] = []
     for constellation in CONSTELLATIONS:
         periods = []
@@ -208,7 +214,7 @@ def range_table(runs: int, seed: int, jobs: int, config: Configuration | None) -
                 alarm = {"event": "false_alarm", "time_s": HOUR_S}
                 rows.append(labels | alarm | alarm_figures(system, int(HOUR_S / period_s), runs, seed, jobs))
             periods.append(period_s)
-    return table(rows)
+    return table_of_rows(rows)
 
 
 @frozen
@@ -229,12 +235,12 @@ class RecordedNoise:
     def bank(self, config: Configuration, rate_hz: float) -> LinearBank:
         """The configured bank on this noise."""
         shares, taus_s = error_model(config.monitors)
-        spec = BankSpec.of(config.monitors, "odometer", rate_hz)
+        spec = BankSpec.from_configuration(config.monitors, "odometer", rate_hz)
         return bank_of_axis(spec, shares * self.sigma_m**2, taus_s, float(np.sqrt(_LASTING)) * self.white_m)
 
     @property
     def row(self) -> Row:
-        """As it stands in the table `noise`."""
+        """As a row of the table `noise`."""
         return {
             "solution": self.solution,
             "runs": self.runs,
@@ -246,7 +252,8 @@ class RecordedNoise:
         }
 
 
-def _on_recorded_noise(result: Path, runs: int, seed: int, jobs: int, config: Configuration | None) -> Contents:
+def _tables_on_recorded_noise(result: Path, runs: int, seed: int, jobs: int, config: Configuration | None) -> Contents:
+    """`noise`, `missed` and `false_alarms` of each solution of a replayed result."""
     noises = recorded_noises(result)
     settings = config or read_config(result) or Configuration()
     missed = [row for noise in noises for row in _missed_rows(noise, settings, runs, seed, jobs)]
@@ -256,9 +263,9 @@ def _on_recorded_noise(result: Path, runs: int, seed: int, jobs: int, config: Co
         bank = noise.bank(settings, noise.rate_hz)
         false_alarms.append(labels | alarm_figures(bank, int(HOUR_S * noise.rate_hz), runs, seed, jobs))
     return {
-        "noise": table([noise.row for noise in noises]),
-        "missed": table(missed),
-        "false_alarms": table(false_alarms),
+        "noise": table_of_rows([noise.row for noise in noises]),
+        "missed": table_of_rows(missed),
+        "false_alarms": table_of_rows(false_alarms),
     }
 
 
@@ -276,10 +283,14 @@ def recorded_noises(result: Path) -> list[RecordedNoise]:
             found=f"{runs.height} fault-free runs, none with `white_noise_along_m`" if runs.height else "no such run",
             remedy="Replay fault-free runs of some minutes, with their odometer.",
         )
-    return [_noise_of(result, solution, part) for (solution,), part in known.group_by("solution", maintain_order=True)]
+    return [
+        _noise_of_solution(result, solution, part)
+        for (solution,), part in known.group_by("solution", maintain_order=True)
+    ]
 
 
-def _noise_of(result: Path, solution: object, runs: pl.DataFrame) -> RecordedNoise:
+def _noise_of_solution(result: Path, solution: object, runs: pl.DataFrame) -> RecordedNoise:
+    """Noise of one solution over the runs of a result."""
     factor = threshold_factor((read_config(result) or Configuration()).monitors.false_alarm_probability)
     ratios = [factor * pl.col(f"along_{scale}_value") / pl.col(f"along_{scale}_threshold") for scale in SCALES]
     judged = [pl.col(f"along_{scale}_state") == MonitorState.PASS.value for scale in SCALES]

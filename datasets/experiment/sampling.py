@@ -80,14 +80,14 @@ class System(Protocol):
     def size(self) -> int:
         """How many values there are."""
 
-    def start(self, runs: int, rng: np.random.Generator) -> Floats:
+    def draw_start(self, runs: int, rng: np.random.Generator) -> Floats:
         """States at the fault's onset, (states, runs)."""
 
-    def following(self, state: Floats, rng: np.random.Generator) -> Floats:
+    def draw_next(self, state: Floats, rng: np.random.Generator) -> Floats:
         """States at the next epoch."""
 
     def values(self, state: Floats) -> Floats:
-        """(values, runs)."""
+        """What the monitors see of the states, (values, runs)."""
 
     def ramp(self, epochs: int, rate_mps: float) -> Floats:
         """What a range ramp adds to the values at epochs 1 .. n, (epochs, values)."""
@@ -104,19 +104,19 @@ class System(Protocol):
     def passing(self, epochs: int) -> Callable[[int, Floats], Bools]:
         """Which runs pass at epoch k (from 0) with these values (values, runs)."""
 
-    def by_lag(self, epochs: int) -> Floats:
+    def covariance_by_lag(self, epochs: int) -> Floats:
         """Covariance of value j at epoch k + lag with value i at k, lags -(n-1) .. n-1; (lags, i, j)."""
 
-    def forced(self, values: Floats, rng: np.random.Generator) -> tuple[Floats, float]:
+    def force_fail(self, values: Floats, rng: np.random.Generator) -> tuple[Floats, float]:
         """What, times the covariance, brings each run's values (runs, values) to a fail drawn at random, and how many
         fails an epoch has on average.
         """
 
-    def fails(self, path: Floats) -> int:
+    def count_fails(self, path: Floats) -> int:
         """Fails of one run, (epochs, values)."""
 
 
-def root_of(covariance: Floats) -> Floats:
+def matrix_root(covariance: Floats) -> Floats:
     """A matrix R with R R' = `covariance` (n, n), which may be singular."""
     values, vectors = np.linalg.eigh(covariance)
     return np.asarray(vectors * np.sqrt(np.maximum(values, 0.0)))
@@ -138,8 +138,8 @@ def false_alarm_probability(system: System, epochs: int, runs: int = 4000, seed:
     """
     # Small enough for one thread of the linear algebra library, whose threads would cost more than they bring.
     size = max(1, min(system.runs_per_block, _LARGEST_BLOCK // (epochs * system.size)))
-    alarms = partial(_alarms, system, epochs)
-    return pooled(np.concatenate(in_pieces(alarms, runs, size, (seed, system.streams[0]), jobs)), runs)
+    alarms = partial(_alarm_estimates, system, epochs)
+    return pool_estimates(np.concatenate(in_pieces(alarms, runs, size, (seed, system.streams[0]), jobs)), runs)
 
 
 def missed_detection_probability(
@@ -147,15 +147,15 @@ def missed_detection_probability(
 ) -> Probability:
     """Probability that no monitor fails at epochs 1 .. n of a range ramp of `rate_mps`; `runs`: sampled paths."""
     miss = partial(miss_estimate, system, epochs, rate_mps, most_probable_miss(system, epochs, rate_mps))
-    return pooled(np.array(in_pieces(miss, runs, population_of(runs), (seed, system.streams[1]), jobs)), runs)
+    return pool_estimates(np.array(in_pieces(miss, runs, population_size(runs), (seed, system.streams[1]), jobs)), runs)
 
 
-def population_of(runs: int) -> int:
+def population_size(runs: int) -> int:
     """Size of the independent populations that share the runs; too small ones would lose all of theirs."""
     return min(max(runs // _POPULATIONS, _SMALLEST_POPULATION), _LARGEST_POPULATION)
 
 
-def pooled(estimates: Floats, runs: int) -> Probability:
+def pool_estimates(estimates: Floats, runs: int) -> Probability:
     """Mean of independent unbiased estimates of equal weight, its relative error, and the gain over counting."""
     greatest = float(estimates.max())
     if greatest == 0.0:
@@ -168,27 +168,28 @@ def pooled(estimates: Floats, runs: int) -> Probability:
     return Probability(mean, error, gain, runs)
 
 
-def _alarms(system: System, epochs: int, runs: int, rng: np.random.Generator) -> Floats:
+def _alarm_estimates(system: System, epochs: int, runs: int, rng: np.random.Generator) -> Floats:
+    """Estimates of the probability of an alarm, one for each of the sampled runs."""
     # Stationary: the covariance depends on the lag alone, and lag zero is in the middle.
-    by_lag = system.by_lag(epochs)
+    by_lag = system.covariance_by_lag(epochs)
     paths = np.empty((epochs, system.size, runs))
-    state = system.start(runs, rng)
+    state = system.draw_start(runs, rng)
     for path in paths:
-        state = system.following(state, rng)
+        state = system.draw_next(state, rng)
         path[:] = system.values(state)
     at = rng.integers(0, epochs, runs)
-    pulls, per_epoch = system.forced(paths[at, :, np.arange(runs)], rng)
+    pulls, per_epoch = system.force_fail(paths[at, :, np.arange(runs)], rng)
     estimates = np.empty(runs)
     for run, (place, pull) in enumerate(zip(at, pulls, strict=True)):
         pulled = np.flatnonzero(pull)
         together = by_lag[epochs - 1 - place : 2 * epochs - 1 - place, pulled]
         # The forced one counts, whatever rounding does to it.
-        count = max(system.fails(paths[:, :, run] + pull[pulled] @ together), 1)
+        count = max(system.count_fails(paths[:, :, run] + pull[pulled] @ together), 1)
         estimates[run] = epochs * per_epoch / count
     return estimates
 
 
-def figures(result: Probability) -> Row:
+def probability_figures(result: Probability) -> Row:
     """The estimate as it stands in a table; nulls where no run came through, which says nothing of the probability.
 
     Below `SMALLEST` it is not given: the model of the noise does not hold so far out. `below` says so in its place.
@@ -204,22 +205,24 @@ def figures(result: Probability) -> Row:
 
 
 def first_below(probability: Callable[[int], float], targets: Sequence[float], most_epochs: int) -> list[int | None]:
-    """Epochs after which a falling probability is below each target, within 2 %; None if that takes too many.
+    """Epochs after which a falling probability is is_below each target, within 2 %; None if that takes too many.
 
     Few runs per step do: time is found far better than probability, which falls steeply. An estimate of zero, all
-    runs lost, says nothing and counts as not below.
+    runs lost, says nothing and counts as not is_below.
     """
     known: dict[int, float] = {}
 
-    def below(epochs: int, target: float) -> bool:
+    def is_below(epochs: int, target: float) -> bool:
+        """Whether the probability after so many epochs is is_below a target, and not an estimate of zero."""
         if epochs not in known:
             known[epochs] = probability(epochs)
         return 0.0 < known[epochs] < target
 
-    return [_bisected(below, target, most_epochs) for target in targets]
+    return [_bisect_epochs(is_below, target, most_epochs) for target in targets]
 
 
-def _bisected(below: Callable[[int, float], bool], target: float, most_epochs: int) -> int | None:
+def _bisect_epochs(below: Callable[[int, float], bool], target: float, most_epochs: int) -> int | None:
+    """Epochs after which a falling probability is below the target, by doubling and halving; None if too many."""
     low, high = 1, 8
     while not below(high, target):
         if high >= most_epochs:
@@ -241,13 +244,16 @@ def most_probable_miss(system: System, epochs: int, rate_mps: float) -> MeanShif
     towards_limit = system.towards_limit(epochs)
     limits = system.limits(epochs, rate_mps)
     for margin in system.margins:
-        shift = _shift(system, limits, margin, towards_limit)
+        shift = _shift_with_margin(system, limits, margin, towards_limit)
         if shift.half_square >= _LEAST_HALF_SQUARE:
             break
     return shift
 
 
-def _shift(system: System, limits: Limits, margin: float, towards_limit: Callable[[int, int], Floats]) -> MeanShift:
+def _shift_with_margin(
+    system: System, limits: Limits, margin: float, towards_limit: Callable[[int, int], Floats]
+) -> MeanShift:
+    """The shift whose path stays within every limit, but for a share of the margin."""
     ramp, threshold, sigma, towards = limits
     epoch: list[int] = []
     limit: list[int] = []
@@ -289,8 +295,9 @@ def miss_estimate(
     moved = shift.mean + system.ramp(epochs, rate_mps)
     passing = system.passing(epochs)
 
-    def step(k: int, state: Floats) -> tuple[Floats, Floats]:
-        following = system.following(state, rng)
+    def shifted_step(k: int, state: Floats) -> tuple[Floats, Floats]:
+        """States at epoch k under the shift, and the logarithms of their weights."""
+        following = system.draw_next(state, rng)
         noise = system.values(following)
         weight = np.where(passing(k, noise + moved[k][:, None]), 0.0, -np.inf)
         # Density of the true noise over that of the shifted one: exp(l' m - l' C l / 2), m the noise at constraints.
@@ -298,7 +305,7 @@ def miss_estimate(
             weight += shift.multiplier[index] * system.on_limits(noise.T)[:, shift.limit[index]]
         return following, weight
 
-    return float(np.exp(log_survival(system.start(runs, rng), step, epochs, rng) - shift.half_square))
+    return float(np.exp(log_survival(system.draw_start(runs, rng), shifted_step, epochs, rng) - shift.half_square))
 
 
 def log_survival(state: Floats, step: Step, epochs: int, rng: np.random.Generator) -> float:
@@ -321,13 +328,13 @@ def log_survival(state: Floats, step: Step, epochs: int, rng: np.random.Generato
         shares = np.exp(weight - greatest)
         if shares.sum() ** 2 < _LEAST_EFFECTIVE * runs * (shares @ shares):
             total += greatest + float(np.log(shares.mean()))
-            state = state[:, _copies(shares, rng)]
+            state = state[:, _resample(shares, rng)]
             weight = np.zeros(runs)
     greatest = float(weight.max())
     return total + greatest + float(np.log(np.exp(weight - greatest).mean()))
 
 
-def _copies(shares: Floats, rng: np.random.Generator) -> Ints:
+def _resample(shares: Floats, rng: np.random.Generator) -> Ints:
     """Systematic resampling: which run each of the next ones continues, in proportion to the shares."""
     ends = np.cumsum(shares) / shares.sum()
     places = (np.arange(shares.size) + rng.random()) / shares.size

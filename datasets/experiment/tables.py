@@ -22,7 +22,7 @@ Row = dict[str, object]
 _TIME_PARTS = ("", "_standard_error", "_low", "_high", "_median", "_median_low", "_median_high")
 
 
-def share(name: str, count: int, trials: int) -> Row:
+def share_columns(name: str, count: int, trials: int) -> Row:
     """`name`, `name_low` and `name_high`: a share and its exact bounds, null without trials."""
     return columns_of(name, clopper_pearson(count, trials))
 
@@ -50,21 +50,22 @@ def time_columns(name: str, times_s: Floats, least: float, greatest: float) -> R
     return dict(zip(columns, of_mean + of_median, strict=True))
 
 
-def table(rows: list[Row]) -> pl.DataFrame:
+def table_of_rows(rows: list[Row]) -> pl.DataFrame:
     """The rows as a table; a column of which no row knows anything is one of numbers."""
     return pl.DataFrame(rows, infer_schema_length=None).with_columns(cs.by_dtype(pl.Null).cast(pl.Float64))
 
 
-def write(out: Path, contents: Contents, settings: Mapping[str, object]) -> list[Path]:
+def write_contents(out: Path, contents: Contents, settings: Mapping[str, object]) -> list[Path]:
     """Every content and `settings.json`, which made them; the same content gives the same bytes."""
     made = json.dumps(dict(settings), indent=2, sort_keys=True) + "\n"
     files = {**contents, "settings.json": made}
     for name, content in files.items():
         if isinstance(content, pl.DataFrame):
             content = noted_bytes(content, {"table": name, "software": SOFTWARE, "settings": made})
-        storage.write_bytes(_path(out, name), content.encode() if isinstance(content, str) else content)
-    return [_path(out, name) for name in files]
+        storage.write_bytes(_file_of(out, name), content.encode() if isinstance(content, str) else content)
+    return [_file_of(out, name) for name in files]
 
 
-def _path(out: Path, name: str) -> Path:
+def _file_of(out: Path, name: str) -> Path:
+    """The file of a content; a table is Parquet."""
     return out / (name if "." in name else f"{name}.parquet")

@@ -12,7 +12,7 @@ from pathlib import Path
 from pipeline.make.receivers import Converted, Gatherings, Purpose, as_run, extend_run, gather
 from pipeline.project.opened import OpenedProject
 from pipeline.read.ingest import read_run
-from pipeline.read.ingest.correct import corrected, corrected_further
+from pipeline.read.ingest.correct import correct_further, correct_run
 from pipeline.storage.noted import note_all_below, noting
 from schemas.config import FixSigma, IngestConfig
 from schemas.errors import UsageError
@@ -58,10 +58,10 @@ def convert_entry(
         made = extend_run(made.run, Path(entry.to), part.found, part.purpose, sigmas, False, common)
         dropped.update(made.dropped)
         listed += made.parts
-    run = corrected(made.run, common)
+    run = correct_run(made.run, common)
     # A log that is a run of this program may have been corrected so when it was written.
     own = [correction for correction in entry.correct if correction not in run.notes.corrections]
-    return Converted(corrected_further(run, own), dict(dropped), tuple(listed)).made_of(noted.listing())
+    return Converted(correct_further(run, own), dict(dropped), tuple(listed)).made_of(noted.listing())
 
 
 def _logs_by_purpose(

@@ -13,7 +13,7 @@ from pipeline.make.receivers.bags import is_bag
 from pipeline.make.receivers.gpsd import HEAD, is_gpsd
 from pipeline.make.survey.map_files import MAP_SUFFIXES
 from pipeline.read.ingest.csv_text import read_log_table
-from pipeline.read.ingest.guesses import POSITION, WORDS, columns_in, first, word_of, words_of_times
+from pipeline.read.ingest.guesses import POSITION, WORDS, columns_in, first_fitting, word_of, words_of_times
 from schemas.config import Configuration, Settings, Vehicle, read_toml, settings_from
 from schemas.errors import BaliseError, UsageError
 from schemas.project import FILE_NAME
@@ -145,8 +145,8 @@ def _kind_of_table(path: Path) -> Kind:
         return "logs"
     words = {name: word_of(name) for name in table.columns if name.strip()}
     times = words_of_times(words)
-    if any(first(times, WORDS[kind]) for kind in ("time", "date", "clock", "week")):
+    if any(first_fitting(times, WORDS[kind]) for kind in ("time", "date", "clock", "week")):
         return "logs"
-    if first(words, WORDS["balise"]):
+    if first_fitting(words, WORDS["balise"]):
         return "balises"
     return "surveys" if set(columns_in("gnss", words)) >= POSITION else "logs"

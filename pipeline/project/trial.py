@@ -21,7 +21,7 @@ from pipeline.project.opened import OpenedProject, named_from
 from pipeline.project.recorded_runs import RecordedRun, group_into_runs, stem_of
 from pipeline.project.run import requested_site
 from pipeline.read.ingest import read_run
-from pipeline.read.ingest.correct import corrected_further
+from pipeline.read.ingest.correct import correct_further
 from pipeline.read.ingest.parts import LogPart, lines_of_parts
 from pipeline.read.site.alike import ambiguities, summarise_findings
 from pipeline.read.site.read import read_site
@@ -337,7 +337,7 @@ def _check_fit(
             sentences = [text.replace(say("misfit_places", "in_stream", "GNSS"), mine) for text in sentences]
         found += [sentence for sentence in sentences if sentence not in found]
         corrections += fresh
-        run = corrected_further(run, fresh)
+        run = correct_further(run, fresh)
     if not corrections:
         return None, entry, report
     accepted = accept(recorded_run.run_id, found, corrections)

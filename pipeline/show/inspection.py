@@ -157,17 +157,17 @@ def inspect_site(
     """
     # What they need takes long to load, and a log needs none of it.
     from pipeline.read.site.alike import ambiguities
-    from pipeline.read.site.describe import describe_site, elements_table, without_balises
-    from pipeline.read.site.neighbours import neighbours
+    from pipeline.read.site.describe import describe_site, elements_table, no_balises_finding
+    from pipeline.read.site.neighbours import neighbour_table
     from pipeline.read.site.survey_findings import survey_findings
 
     config = config or Configuration()
     site = read_site(path, config.site)
-    findings = (*ambiguities(site, config), *site.findings, *without_balises(site.balises))
+    findings = (*ambiguities(site, config), *site.findings, *no_balises_finding(site.balises))
     tables = {
         "Site": _figures_table(describe_site(site)),
         "Elements": elements_table(site),
-        "Neighbours": neighbours(site, config),
+        "Neighbours": neighbour_table(site, config),
         "Findings": findings_table(findings),
     }
     if result is None:

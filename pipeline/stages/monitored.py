@@ -84,10 +84,10 @@ def monitor_solution(
         # A balise valid in one direction means that of the train, not of one step of the positions (DOMAIN section 4).
         direction = direction_by_evidence(aligned, matched.path, evidence, prepared.vehicle, config)
         aligned = replace(aligned, direction=direction)
-    channel = _other_solution(prepared, solution, aligned, matches)
+    channel = _channel_on_path(prepared, solution, aligned, matches)
     # What is made of the positions cannot say that they are right (DOMAIN section 5.0).
     blind_along = NotEvaluated.ODOMETER_OF_GNSS if odometry is not None and odometry.of_gnss else None
-    singles = _without_memory(prepared, solution, aligned, channel)
+    singles = _single_verdicts(prepared, solution, aligned, channel)
     bank = MonitorBank(aligned, singles, config, blind_along, along)
     balises = matched.path.balises_on_path(prepared.site.balises)
     reads = _reads_on_odometer(prepared.run.balise_reads, aligned, odometry)
@@ -102,19 +102,20 @@ def monitor_solution(
     return MonitoredSolution(prepared, replayed, matched, aligned, odometry, channel, singles, bank, lds)
 
 
-def _other_solution(
+def _channel_on_path(
     prepared: PreparedRun, solution: str, aligned: AlignedEpochs, matches: Mapping[str, Match]
 ) -> pl.DataFrame | None:
-    """None if not named or not recorded."""
+    """The solution of the channel monitor on this one's path; None if none is named or it is not recorded."""
     channel = prepared.config.monitors.channel_reference
     if channel is None or channel == solution or channel not in matches:
         return None
     return on_path_of(aligned.table, matches[channel].epochs.table, prepared.config.lds)
 
 
-def _without_memory(
+def _single_verdicts(
     prepared: PreparedRun, solution: str, aligned: AlignedEpochs, channel: pl.DataFrame | None
 ) -> dict[str, Verdicts]:
+    """Verdicts of the monitors that look at each epoch by itself, by the monitor's name."""
     named = prepared.config.monitors.channel_reference
     absent = NO_OTHER_SOLUTION if named in (None, solution) else NotEvaluated.OTHER_NOT_RECORDED
     given = MonitorInput(aligned, prepared.ranges(solution), channel, absent, prepared.config)
@@ -124,7 +125,7 @@ def _without_memory(
 def _reads_on_odometer(
     reads: pl.DataFrame | None, aligned: AlignedEpochs, odometry: Odometry | None
 ) -> pl.DataFrame | None:
-    """Telegrams with the odometer at each, on the scale of `aligned`."""
+    """Balise reads with the odometer at each [m], on the scale of `aligned`; as they are without an odometer."""
     if reads is None or odometry is None:
         return reads
     odometer_m = odometer_at(times_ns(reads), aligned, odometry)

@@ -153,7 +153,7 @@ def prepare(
     recorded, counts = clean(run, config, clock_advice)
     journey = without_undated_streams(recorded)
     sensors = () if journey.odometer is None else (journey.odometer, *journey.other_odometers)
-    found = [_follows(sensor, journey, config) for sensor in sensors]
+    found = [_test_following(sensor, journey, config) for sensor in sensors]
     odometers = tuple(
         # Scale, latency and origin of the vehicle file are of the odometer that the LDS uses.
         replace(odometer, follows_gnss=any(one.found(config.evidence) for one in found[number].values()))
@@ -170,8 +170,8 @@ def prepare(
     return PreparedRun(recorded, journey, site, vehicle, config, counts, odometers, counted, follows)
 
 
-def _follows(sensor: pl.DataFrame, run: RunLog, config: Configuration) -> dict[str, Follows]:
-    """Whether one odometer is made of the positions of each solution."""
+def _test_following(sensor: pl.DataFrame, run: RunLog, config: Configuration) -> dict[str, Follows]:
+    """Whether one odometer is made of the positions, by the name of the solution."""
     return {
         str(name): follows_positions(sensor, fixes, config)
         for (name,), fixes in run.gnss.partition_by("solution", as_dict=True).items()

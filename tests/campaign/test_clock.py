@@ -87,7 +87,7 @@ def test_wrong_clock_and_files_from_the_future(
     assert not unfinished.exists()
     assert result_bytes(out) == result_bytes(undisturbed)
     assert campaign_bytes(out) == campaign_bytes(undisturbed)
-    assert cli._guarded(command(trial, out)[3:], debug=False) == 0
+    assert cli._run_guarded(command(trial, out)[3:], debug=False) == 0
     assert "(4 of them complete before)" in capfd.readouterr().out
     times = [line.split("T")[0] for line in (out / "replay.log").read_text().splitlines()]
     assert times[0] > times[-1] > min(times), "the clocks were not wrong"

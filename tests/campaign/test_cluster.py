@@ -74,7 +74,7 @@ def test_whatever_becomes_of_other_runs_the_bytes_are_the_same(
     def kill(run_id: str, age_s: float) -> None:
         if run_id not in deaths or age_s < _BEGUN_S or (run_id == "unlucky" and deaths[run_id]):
             return
-        if len(deaths[run_id]) > [lost_text for lost_text, _ in spy.losses].count(run_id):
+        if len(deaths[run_id]) > [lost for lost, _ in spy.losses].count(run_id):
             return
         pids = cluster.worker_pids
         deaths[run_id].append(pids[0])

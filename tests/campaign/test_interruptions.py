@@ -201,7 +201,7 @@ def alive(pid: int) -> bool:
 
 def of_this_process(arguments: list[str]) -> int:
     """Exit status of a command line that does not need a process of its own."""
-    return cli._guarded(arguments[3:], debug=False)
+    return cli._run_guarded(arguments[3:], debug=False)
 
 
 @pytest.mark.usefixtures("in_process")

@@ -169,7 +169,7 @@ def test_json_on_both_streams(
 ) -> None:
     flags = ["--json", "--quiet"] if quiet else ["--json"]
     runs = map(str, small_trial.paths[:2])
-    cli._guarded(["replay", *runs, "--site", str(small_trial.site), "--out", str(tmp_path), *flags], debug=False)
+    cli._run_guarded(["replay", *runs, "--site", str(small_trial.site), "--out", str(tmp_path), *flags], debug=False)
     said = capfd.readouterr()
     result = json.loads(said.out)
     assert [row["run_id"] for row in result["runs"]] == ["run0", "run1"]

@@ -14,7 +14,7 @@ ROOT = Path(__file__).parents[2]
 
 LOADED = """
 import sys, cli
-cli._guarded(sys.argv[1:], False)
+cli._run_guarded(sys.argv[1:], False)
 print([name for name in ('polars', 'numpy', 'scipy', 'pyarrow', 'schemas.config') if name in sys.modules])
 """
 
@@ -25,7 +25,7 @@ log, site, out = sys.argv[1:]
 parts = ('scipy.spatial', 'scipy.sparse', 'scipy.linalg', 'scipy.special')
 def loaded():
     print([name for name in parts if name in sys.modules], flush=True)
-cli._guarded(['inspect', log, '--json'], False)
+cli._run_guarded(['inspect', log, '--json'], False)
 loaded()
 import pipeline.campaign.worker as worker
 def stop(*given, **named):
@@ -34,7 +34,7 @@ def stop(*given, **named):
 for name in ('read_run', 'RecordedLog'):
     if hasattr(worker, name):
         setattr(worker, name, stop)
-cli._guarded(['replay', log, '--site', site, '--out', out, '--quiet'], False)
+cli._run_guarded(['replay', log, '--site', site, '--out', out, '--quiet'], False)
 """
 
 
@@ -59,7 +59,7 @@ def test_a_log_needs_no_search_trees_and_no_matrices(small_trial: SmallTrial, tm
 REPLAYED = """
 import sys, cli
 log, site, out = sys.argv[1:]
-cli._guarded(['replay', log, '--site', site, '--out', out, '--quiet'], False)
+cli._run_guarded(['replay', log, '--site', site, '--out', out, '--quiet'], False)
 print([name for name in ('pandas', 'matplotlib', 'shapely', 'duckdb', 'msgspec', 'dask') if name in sys.modules])
 """
 

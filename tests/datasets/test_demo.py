@@ -10,8 +10,8 @@ import polars as pl
 import pytest
 
 import cli
-from datasets.comparison import checks_table, compare, describe_faults
-from datasets.demo import DemoResult, demo, demo_scenario
+from datasets.comparison import checks_table, compare_run, describe_faults
+from datasets.demo import DemoResult, demo_scenario, make_demo
 from datasets.trial import build_run, build_site
 from pipeline import replay
 from pipeline.campaign.verify import verify, verify_by_replay
@@ -26,7 +26,7 @@ from tests.docs.json_page import fields, places
 def result(tmp_path_factory: pytest.TempPathFactory) -> DemoResult:
     with pytest.MonkeyPatch.context() as patch:
         work_here(patch)
-        return demo(tmp_path_factory.mktemp("demo"))
+        return make_demo(tmp_path_factory.mktemp("demo"))
 
 
 @pytest.mark.usefixtures("in_process")
@@ -46,9 +46,9 @@ def test_the_demo_is_a_project_that_is_up_to_date(
     result: DemoResult, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.chdir(result.page.parents[2])
-    assert cli._guarded(["run", "--jobs", "1"], debug=False) == 0
+    assert cli._run_guarded(["run", "--jobs", "1"], debug=False) == 0
     assert "All was up to date." in capfd.readouterr().out
-    assert cli._guarded(["verify"], debug=False) == 0
+    assert cli._run_guarded(["verify"], debug=False) == 0
 
 
 def test_the_replay_finds_what_was_injected(result: DemoResult) -> None:
@@ -70,7 +70,7 @@ def test_another_seed_shows_the_same() -> None:
     checks = []
     for spec in scenario.runs:
         run = build_run(scenario, spec)
-        checks += compare(spec, run, replay(run, site, scenario.vehicle if spec.vehicle else Vehicle()))
+        checks += compare_run(spec, run, replay(run, site, scenario.vehicle if spec.vehicle else Vehicle()))
     assert checks_table(checks).filter(~pl.col("agrees")).rows() == []
 
 
@@ -114,9 +114,9 @@ def test_a_spoilt_result_differs(result: DemoResult, run_id: str, spoil: dict) -
     scenario = result.scenario
     spec = next(run for run in scenario.runs if run.id == run_id)
     run, tables = build_run(scenario, spec), tables_of(result, run_id)
-    assert checks_table(compare(spec, run, tables))["agrees"].all()
+    assert checks_table(compare_run(spec, run, tables))["agrees"].all()
     spoilt = replace(tables, **{name: change(getattr(tables, name)) for name, change in spoil.items()})
-    assert not checks_table(compare(spec, run, spoilt))["agrees"].all()
+    assert not checks_table(compare_run(spec, run, spoilt))["agrees"].all()
 
 
 def test_the_ending_is_one_line_per_run_and_a_sentence(result: DemoResult) -> None:

@@ -7,11 +7,11 @@ import pytest
 
 from datasets.faults import (
     FaultSpec,
+    fault_offset_m,
     faults_table,
     in_sector,
     odometer_increments,
     odometer_speeds,
-    offset_m,
     position_effect,
 )
 from schemas.config import settings_from
@@ -40,12 +40,12 @@ SECONDS = np.arange(8.0)
     ],
 )
 def test_offsets_over_time(values: dict[str, object], expected: list[float]) -> None:
-    assert offset_m(fault(**values), SECONDS, rng()).tolist() == expected
+    assert fault_offset_m(fault(**values), SECONDS, rng()).tolist() == expected
 
 
 def test_noise_bursts_have_their_sigma_and_end() -> None:
     t_s = np.arange(0.0, 4000.0)
-    burst = offset_m(fault(kind="noise", sigma_m=3.0, duration_s=3000.0), t_s, rng())
+    burst = fault_offset_m(fault(kind="noise", sigma_m=3.0, duration_s=3000.0), t_s, rng())
     assert burst[2:3002].std() == pytest.approx(3.0, rel=0.05)
     assert not burst[:2].any()
     assert not burst[3002:].any()

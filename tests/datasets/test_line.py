@@ -34,7 +34,7 @@ def test_chainage_is_the_distance_along_the_rail() -> None:
 
 def test_curves_turn_by_length_over_radius_and_to_the_named_side() -> None:
     line = build_line(spec())
-    heading = line.at(np.array([0.0, 700.0, 1150.0, 1750.0])).heading_deg
+    heading = line.places_at(np.array([0.0, 700.0, 1150.0, 1750.0])).heading_deg
     assert heading[1] == pytest.approx(30.0, abs=1e-9)
     # Left turns lower the heading; 350 m and 700 m of 900 m radius, 250 m of 1200 m radius to the right.
     assert heading[2] == pytest.approx(30.0 - np.degrees(350.0 / 900.0), abs=1e-6)
@@ -42,13 +42,13 @@ def test_curves_turn_by_length_over_radius_and_to_the_named_side() -> None:
 
 
 def test_grade_is_rise_over_run() -> None:
-    height = build_line(spec()).at(np.array([100.0, 600.0])).height_m
+    height = build_line(spec()).places_at(np.array([100.0, 600.0])).height_m
     assert height[1] - height[0] == pytest.approx(500.0 * np.sin(np.arctan(0.01)), abs=1e-9)
 
 
 def test_a_place_beyond_the_line_is_refused() -> None:
     with pytest.raises(ConfigError, match="leaves the line"):
-        build_line(spec()).at(np.array([5001.0]))
+        build_line(spec()).places_at(np.array([5001.0]))
 
 
 def test_reversed_elements_meet_their_neighbours_at_the_linked_ends() -> None:
@@ -107,7 +107,7 @@ def test_parallel_tracks_run_beside_the_line_unlinked() -> None:
     parallel = {"id": "P", "from_m": 100.0, "to_m": 2900.0, "left_m": 4.5}
     line_spec = spec(parallels=[parallel])
     table = track(line_spec).filter(pl.col("netelement_id") == "P")
-    places = build_line(line_spec).at(100.0 + table["measure_m"].to_numpy())
+    places = build_line(line_spec).places_at(100.0 + table["measure_m"].to_numpy())
     columns = ("latitude_deg", "longitude_deg", "height_m")
     gap = earth_centred_m(*(table[c].to_numpy() for c in columns)) - earth_centred_m(
         *(getattr(places, c) for c in columns)
@@ -117,5 +117,5 @@ def test_parallel_tracks_run_beside_the_line_unlinked() -> None:
 
 
 def test_left_is_left_of_the_heading() -> None:
-    north = build_line(spec(heading_deg=0.0)).at(np.array([10.0]))
+    north = build_line(spec(heading_deg=0.0)).places_at(np.array([10.0]))
     assert offset_places(north, 5.0).longitude_deg[0] < north.longitude_deg[0]

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import sidereon
 
-from datasets.solution import K_H_NPA, K_H_PA, design_rows, least_squares, protection_levels, solve
+from datasets.solution import K_H_NPA, K_H_PA, design_rows, least_squares, protection_levels, solve_positions
 
 PLACE = (np.radians(50.0), np.radians(14.0))
 
@@ -68,7 +68,7 @@ def test_solution_is_the_weighted_least_squares() -> None:
     names, azimuth, elevation, sigma = sky(3)
     error = np.random.default_rng(9).normal(size=9) * sigma
     every = np.ones((1, 9), dtype=bool)
-    found = solve(names, azimuth[None], elevation[None], sigma[None], error[None], every, every)
+    found = solve_positions(names, azimuth[None], elevation[None], sigma[None], error[None], every, every)
     design = design_rows(names, azimuth, elevation)
     state, *_ = np.linalg.lstsq(design / sigma[:, None], error / sigma, rcond=None)
     assert found.error_m[0] == pytest.approx(state[:3], abs=1e-10)
@@ -81,7 +81,7 @@ def test_a_moved_receiver_leaves_no_residual() -> None:
     names, azimuth, elevation, sigma = sky(4)
     moved = design_rows(names, azimuth, elevation) @ np.array([3.0, -2.0, 1.0, 7.0, -4.0])
     every = np.ones((1, 9), dtype=bool)
-    found = solve(names, azimuth[None], elevation[None], sigma[None], moved[None], every, every)
+    found = solve_positions(names, azimuth[None], elevation[None], sigma[None], moved[None], every, every)
     assert found.error_m[0] == pytest.approx([3.0, -2.0, 1.0], abs=1e-9)
     assert np.abs(found.residual_m).max() < 1e-9
 
@@ -92,7 +92,7 @@ def test_empirical_covariance_is_the_stated_one() -> None:
     error = np.random.default_rng(6).normal(size=(epochs, 9)) * sigma
     every = np.ones((epochs, 9), dtype=bool)
     wide = [np.broadcast_to(values, (epochs, 9)) for values in (azimuth, elevation, sigma)]
-    found = solve(names, *wide, error, every, every)
+    found = solve_positions(names, *wide, error, every, every)
     assert np.cov(found.error_m.T) == pytest.approx(found.covariance_m2[0], rel=0.1, abs=0.05)
 
 
@@ -102,7 +102,7 @@ def test_too_few_satellites_give_no_position_and_unused_ones_a_residual() -> Non
     usable[0, 3:] = False
     usable[1, 0] = False
     wide = [np.broadcast_to(values, (2, 9)) for values in (azimuth, elevation, sigma)]
-    found = solve(names, *wide, np.ones((2, 9)), usable, np.ones((2, 9), dtype=bool))
+    found = solve_positions(names, *wide, np.ones((2, 9)), usable, np.ones((2, 9), dtype=bool))
     assert found.solved.tolist() == [False, True]
     assert not found.used[0].any()
     assert np.isfinite(found.residual_m[1]).all()

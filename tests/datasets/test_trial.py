@@ -118,7 +118,7 @@ def test_a_leap_follows_the_track_for_its_three_seconds() -> None:
     hit = (t_s >= begin_s - 1e-9) & (t_s < begin_s + 3.0 - 1e-9)
     assert hit.sum() == 30
     assert motion.chainage_m(np.array([begin_s]))[0] == pytest.approx(1500.0, abs=2.5)
-    places = line.at(motion.chainage_m(t_s) + np.where(hit, 200.0, 0.0))
+    places = line.places_at(motion.chainage_m(t_s) + np.where(hit, 200.0, 0.0))
     gap = xyz(run.gnss) - earth_centred_m(places.latitude_deg, places.longitude_deg, places.height_m)
     assert np.abs(gap).max() < 1e-4
 
@@ -140,7 +140,7 @@ def test_the_antenna_sits_where_the_vehicle_says() -> None:
     spec = scenario({"reference": {"sigma_m": 0.0}}, vehicle={"gnss_antenna_ahead_m": 7.0, "antenna_height_m": 4.0})
     run = run_of(spec)
     assert run.reference is not None
-    places = build_line(spec.line).at(np.array([207.0]))
+    places = build_line(spec.line).places_at(np.array([207.0]))
     gap = xyz(run.reference.head(1)) - earth_centred_m(places.latitude_deg, places.longitude_deg, places.height_m)
     assert np.linalg.norm(gap) == pytest.approx(4.0, abs=1e-3)
 

@@ -85,7 +85,7 @@ def run_commands(page: Path, workplace: Path, capfd: pytest.CaptureFixture[str])
     for arguments, status in lines(page):
         # A user's command is a process of its own, which knows the program as it is now.
         software_digest.cache_clear()
-        found = cli._guarded(arguments[1:], debug=False)
+        found = cli._run_guarded(arguments[1:], debug=False)
         said = capfd.readouterr()
         assert found == status, f"{' '.join(arguments)}\n{said.out}\n{said.err}"
         assert "Traceback" not in said.err

@@ -84,7 +84,7 @@ def _prepare(folder: Path) -> None:
 def _answer(line: str, capfd: pytest.CaptureFixture[str]) -> Any:
     # A user's command is a process of its own, which knows the program as it is now.
     software_digest.cache_clear()
-    status = cli._guarded(shlex.split(line)[1:], debug=False)
+    status = cli._run_guarded(shlex.split(line)[1:], debug=False)
     said = capfd.readouterr()
     assert status in (0, 1), f"{line}\n{said.err}"
     return json.loads(said.out)

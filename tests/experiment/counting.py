@@ -24,9 +24,9 @@ from datasets.experiment.sampling import (
     false_alarm_probability,
     first_below,
     missed_detection_probability,
-    pooled,
+    pool_estimates,
 )
-from datasets.experiment.workers import generator, in_blocks
+from datasets.experiment.workers import in_blocks, random_generator
 from pipeline.stages.run_row.bounds import clopper_pearson
 from schemas.arrays import Floats
 
@@ -49,9 +49,9 @@ def counted_misses(system: System, epochs: int, rate_mps: float, runs: int, seed
     ramp, passing = system.ramp(epochs, rate_mps), system.passing(epochs)
 
     def block(size: int, rng: np.random.Generator) -> Floats:
-        state, alive = system.start(size, rng), np.ones(size, dtype=np.bool_)
+        state, alive = system.draw_start(size, rng), np.ones(size, dtype=np.bool_)
         for k in range(epochs):
-            state = system.following(state, rng)
+            state = system.draw_next(state, rng)
             alive &= passing(k, system.values(state) + ramp[k][:, None])
             if not alive.any():
                 break
@@ -62,8 +62,8 @@ def counted_misses(system: System, epochs: int, rate_mps: float, runs: int, seed
 
 def _counted(block: Callable[[int, np.random.Generator], Floats], runs: int, key: tuple[int, int]) -> Probability:
     sizes = in_blocks(runs, _BLOCK)
-    parts = [block(size, generator(*key, number)) for number, size in enumerate(sizes)]
-    return pooled(np.concatenate(parts), runs)
+    parts = [block(size, random_generator(*key, number)) for number, size in enumerate(sizes)]
+    return pool_estimates(np.concatenate(parts), runs)
 
 
 def agree(sampled: Probability, counted: Probability) -> bool:

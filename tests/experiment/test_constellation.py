@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from datasets.constellation import GALILEO, GPS, SIDEREAL_DAY_S, look_angles, satellite_positions, visible
+from datasets.constellation import GALILEO, GPS, SIDEREAL_DAY_S, look_angles, satellite_positions, visible_satellites
 
 T0_NS = 1_710_892_800_000_000_000
 
@@ -54,7 +54,7 @@ def test_a_satellite_in_the_zenith_and_one_in_the_south() -> None:
 
 def test_visible_respects_the_mask_and_order() -> None:
     t = T0_NS + np.arange(3) * 3_600_000_000_000
-    frame = visible(GPS + GALILEO, t, 50.85, 4.35, mask_deg=10.0)
+    frame = visible_satellites(GPS + GALILEO, t, 50.85, 4.35, mask_deg=10.0)
     assert frame["elevation_deg"].min() >= 10.0  # type: ignore[operator]
     assert frame["t"].is_sorted()
     counts = frame.group_by("t", maintain_order=True).len()["len"].to_list()

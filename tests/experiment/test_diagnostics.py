@@ -21,7 +21,7 @@ from datasets.experiment.monte_carlo import (
     first_passages,
 )
 from datasets.experiment.tables import time_columns
-from datasets.experiment.workers import generator
+from datasets.experiment.workers import random_generator
 from pipeline.show.svg_plot import even_ticks
 from pipeline.stages.monitors.pseudorange import range_variances_m2
 from tests.experiment.sigmas import bank_sigmas, limit_sigmas
@@ -75,7 +75,7 @@ def naive_first(plan: ExperimentPlan, basis: np.ndarray, weights: np.ndarray, ra
 @pytest.mark.parametrize("probability", [1e-7, 1e-3])
 def test_first_passages_equal_those_of_naive_evaluation(probability: float) -> None:
     plan = small_plan(false_alarm_probability=probability)
-    paths = NoisePaths(plan, 20, generator(5))
+    paths = NoisePaths(plan, 20, random_generator(5))
     basis = np.concatenate([paths.advance(50).copy() for _ in range(plan.span_s // 50)])
     fast = first_passages_from(plan, basis)
     for question in range(len(plan.questions)):
@@ -86,19 +86,19 @@ def test_first_passages_equal_those_of_naive_evaluation(probability: float) -> N
 
 def first_passages_from(plan: ExperimentPlan, basis: np.ndarray) -> np.ndarray:
     """The fast evaluation on a given path."""
-    weights = NoisePaths(plan, 1, generator(0)).weights
+    weights = NoisePaths(plan, 1, random_generator(0)).weights
     watch = monte_carlo.FirstAnswers(plan, bank_forms(plan), failure_forms(plan), weights, basis.shape[2])
-    for begin, end in monte_carlo._blocks(plan.onset_s, plan.span_s, 4):
+    for begin, end in monte_carlo._growing_blocks(plan.onset_s, plan.span_s, 4):
         watch.after_onset(basis[begin:end], begin)
     return watch.first[: len(plan.questions)]
 
 
 def test_failure_is_the_first_epoch_beyond_the_limit() -> None:
     plan = small_plan(rates_mps=(1.0, 5.0))
-    paths = NoisePaths(plan, 15, generator(6))
+    paths = NoisePaths(plan, 15, random_generator(6))
     basis = np.concatenate([paths.advance(50).copy() for _ in range(plan.span_s // 50)])
     watch = monte_carlo.FirstAnswers(plan, bank_forms(plan), failure_forms(plan), paths.weights, 15)
-    for begin, end in monte_carlo._blocks(plan.onset_s, plan.span_s, 4):
+    for begin, end in monte_carlo._growing_blocks(plan.onset_s, plan.span_s, 4):
         watch.after_onset(basis[begin:end], begin)
     east_north = basis[:, -2:]
     elapsed = np.maximum(np.arange(1, plan.span_s + 1) - plan.onset_s, 0)
@@ -115,7 +115,7 @@ def test_failure_is_the_first_epoch_beyond_the_limit() -> None:
 def test_vector_processes_equal_satellite_processes_in_law() -> None:
     """Covariances over a lag: simulated basis against the sum over satellites worked out directly."""
     plan = small_plan(span_s=64, onset_s=32)
-    paths = NoisePaths(plan, 40_000, generator(7))
+    paths = NoisePaths(plan, 40_000, random_generator(7))
     basis = paths.advance(31)
     gain, variances = plan.geometry.gain, plan.geometry.range_variance_m2
     for lag in (0, 30):
@@ -128,7 +128,7 @@ def test_vector_processes_equal_satellite_processes_in_law() -> None:
 def test_exact_sigmas_are_those_of_the_simulated_monitors() -> None:
     plan = small_plan(span_s=400, onset_s=399)
     forms = bank_forms(plan)
-    paths = NoisePaths(plan, 4_000, generator(8))
+    paths = NoisePaths(plan, 4_000, random_generator(8))
     for _ in range(8):
         basis = paths.advance(50)
     values = (forms.rows * paths.weights) @ basis[-1]
@@ -154,7 +154,7 @@ def test_white_odometer_noise_alone_gives_the_textbook_ewma_sigma() -> None:
 def test_signals_and_basis_agree_in_size() -> None:
     plan = small_plan()
     assert plan.basis_size == len(SIGNALS) * plan.alphas.size + 2
-    assert NoisePaths(plan, 3, generator(1)).weights.size == plan.basis_size
+    assert NoisePaths(plan, 3, random_generator(1)).weights.size == plan.basis_size
 
 
 @pytest.mark.usefixtures("in_process")
@@ -275,10 +275,10 @@ def test_a_sky_without_the_faulty_satellite_is_refused() -> None:
 
 def test_fault_free_runs_are_not_alarmed_more_often_than_the_bank_allows() -> None:
     plan = small_plan(span_s=501, onset_s=500, false_alarm_probability=1e-3)
-    result = first_passages(plan, bank_forms(plan), failure_forms(plan), 1000, generator(9))
+    result = first_passages(plan, bank_forms(plan), failure_forms(plan), 1000, random_generator(9))
     assert result.alarmed_before[:, :].mean() < 4 * 9 * 500 * 1e-3
     stricter = replace(plan, false_alarm_probability=1e-6)
-    calm = first_passages(stricter, bank_forms(stricter), failure_forms(stricter), 1000, generator(9))
+    calm = first_passages(stricter, bank_forms(stricter), failure_forms(stricter), 1000, random_generator(9))
     assert calm.alarmed_before.mean() < 0.02 < result.alarmed_before.mean()
 
 
@@ -286,7 +286,7 @@ def test_figures_of_hand_made_tables() -> None:
     """Every figure stands for itself, and is drawn where the tables know nothing too."""
     geometry = geometry_table(default_geometry("gps"))
     plan = small_plan(rates_mps=(0.03, 0.1, 1.0), readings=("increments",))
-    few = first_passages(plan, bank_forms(plan), failure_forms(plan), 1, generator(3))
+    few = first_passages(plan, bank_forms(plan), failure_forms(plan), 1, random_generator(3))
     detection = detection_times(plan, few)
     assert detection["time_to_detect_s"].null_count() == detection.height
     pmd = pl.DataFrame(

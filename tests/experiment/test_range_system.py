@@ -9,9 +9,9 @@ import pytest
 
 from datasets.experiment import EXPERIMENTS, rare
 from datasets.experiment.geometry import CONSTELLATIONS, Constellation, default_geometry
-from datasets.experiment.range_system import RangePlan, miss_at_one_epoch, range_system, statistic
+from datasets.experiment.range_system import RangePlan, miss_at_one_epoch, monitor_statistic, range_system
 from datasets.experiment.sampling import false_alarm_probability, missed_detection_probability
-from datasets.experiment.workers import generator
+from datasets.experiment.workers import random_generator
 from pipeline.stages.monitors.pseudorange import clock_columns, line_of_sight_rows, pseudorange_monitor
 from schemas.config import Configuration, MonitorConfig
 from schemas.stages import AlignedEpochs
@@ -29,7 +29,7 @@ def test_projection_equals_the_monitor_of_the_replay(constellation: Constellatio
     heading, survey = 30.0, 1.0
     rng = np.random.default_rng(2)
     errors = rng.normal(0.0, 2.0, len(geometry.svs))
-    one = statistic(RangePlan(geometry, survey_m=survey), heading)
+    one = monitor_statistic(RangePlan(geometry, survey_m=survey), heading)
     rows = line_of_sight_rows(geometry.azimuth_deg, geometry.elevation_deg)
     position = geometry.gain @ errors
     design = np.hstack([rows, clock_columns(geometry.svs)])
@@ -71,12 +71,12 @@ def test_projection_equals_the_monitor_of_the_replay(constellation: Constellatio
 @pytest.mark.parametrize("constellation", CONSTELLATIONS)
 def test_residuals_are_white_at_an_epoch_and_related_over_time_as_simulated(constellation: Constellation) -> None:
     system = range_system(plan(constellation, period_s=100.0), 30.0)
-    assert system.by_lag(1)[0] == pytest.approx(np.eye(system.size), abs=1e-12)
-    rng = generator(1)
-    first = system.start(40_000, rng)
-    second = system.following(first, rng)
+    assert system.covariance_by_lag(1)[0] == pytest.approx(np.eye(system.size), abs=1e-12)
+    rng = random_generator(1)
+    first = system.draw_start(40_000, rng)
+    second = system.draw_next(first, rng)
     together = system.values(second) @ system.values(first).T / 40_000
-    assert together == pytest.approx(system.by_lag(2)[2], abs=5 / np.sqrt(40_000))
+    assert together == pytest.approx(system.covariance_by_lag(2)[2], abs=5 / np.sqrt(40_000))
 
 
 @pytest.mark.parametrize("constellation", CONSTELLATIONS)

@@ -13,13 +13,13 @@ from datasets.experiment.rare import banks, epochs_until, failure_epoch
 from datasets.experiment.sampling import (
     Probability,
     false_alarm_probability,
-    figures,
     first_below,
     missed_detection_probability,
     most_probable_miss,
-    population_of,
+    population_size,
+    probability_figures,
 )
-from datasets.experiment.workers import generator, in_blocks
+from datasets.experiment.workers import in_blocks, random_generator
 from schemas.config import Configuration, MonitorConfig
 from schemas.errors import UsageError
 from tests.experiment.counting import agree, counted_alarms, counted_misses
@@ -30,11 +30,11 @@ GPS = default_geometry("gps")
 
 def monitored_noise(system: LinearBank, epochs: int, runs: int) -> np.ndarray:
     """Noise of all monitors, (epochs, monitors, runs)."""
-    rng = generator(1)
-    state = system.start(runs, rng)
+    rng = random_generator(1)
+    state = system.draw_start(runs, rng)
     values = []
     for _ in range(epochs):
-        state = system.following(state, rng)
+        state = system.draw_next(state, rng)
         values.append(system.values(state).copy())
     return np.stack(values)
 
@@ -189,7 +189,7 @@ def test_no_probability_below_1e_12_is_stated() -> None:
     """And none that came out as zero: that no run came through proves nothing."""
     wanted = {1e-12: (1e-12, None, 0.1), 9e-13: (None, 1e-12, None), 0.0: (None, None, None)}
     for value, expected in wanted.items():
-        row = figures(Probability(value, 0.1, 10.0, 100))
+        row = probability_figures(Probability(value, 0.1, 10.0, 100))
         assert (row["probability"], row["below"], row["relative_error"]) == expected
 
 
@@ -203,9 +203,9 @@ def test_intervals_that_meet_by_hand() -> None:
 
 
 def test_runs_are_shared_by_populations_of_some_size() -> None:
-    assert in_blocks(20_000, population_of(20_000)) == [1_000] * 20
-    assert in_blocks(1_100, population_of(1_100)) == [250] * 4 + [100]
-    assert in_blocks(7, population_of(7)) == [7]
+    assert in_blocks(20_000, population_size(20_000)) == [1_000] * 20
+    assert in_blocks(1_100, population_size(1_100)) == [250] * 4 + [100]
+    assert in_blocks(7, population_size(7)) == [7]
 
 
 def test_a_ramp_below_all_thresholds_is_sampled_well_too() -> None:
@@ -238,7 +238,7 @@ def test_a_configured_bank_is_judged(tmp_path: Path) -> None:
     config = Configuration(
         monitors=MonitorConfig(ewma_alphas=(0.2, 0.05, 0.005), odometer_sigma_mps=0.1, false_alarm_probability=1e-6)
     )
-    spec = BankSpec.of(config.monitors, "odometer_and_track", 10.0)
+    spec = BankSpec.from_configuration(config.monitors, "odometer_and_track", 10.0)
     assert spec.weights == (1.0, 0.2, 0.05, 0.005)
     assert (spec.odometer_m, spec.false_alarm_probability, spec.rate_hz) == (0.1, 1e-6, 10.0)
     assert all(chosen.spec.weights == spec.weights for _, chosen in banks(config))

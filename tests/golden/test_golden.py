@@ -16,7 +16,7 @@ import pytest
 
 from datasets.motion import build_motion
 from datasets.scenario import Scenario, load_scenario
-from datasets.to_contract import table_of
+from datasets.to_contract import table_of_contract
 from datasets.trial import write_trial
 from pipeline import replay
 from pipeline.read.ingest import read_run
@@ -58,7 +58,7 @@ def with_reads(run: RunLog, scenario: Scenario) -> RunLog:
     start = run.odometer["t"][0]
     read = [one for one in scenario.line.balises if one.kind is BaliseKind.PHYSICAL]
     times = [start + timedelta(seconds=round(motion.time_at(one.at_m), 3)) for one in read]
-    return run.with_streams(balise_reads=table_of(BaliseReads, t=times, balise_id=[one.id for one in read]))
+    return run.with_streams(balise_reads=table_of_contract(BaliseReads, t=times, balise_id=[one.id for one in read]))
 
 
 def with_radar(run: RunLog, scenario: Scenario) -> RunLog:

@@ -20,7 +20,7 @@ import numpy as np
 import polars as pl
 import pytest
 
-from datasets.recordings import recordings
+from datasets.recordings import public_recordings
 from pipeline.make.survey.make import make_site, site_request
 from pipeline.make.survey.sources import read_surveys
 from pipeline.project.convert import convert_entry, logs_of
@@ -73,7 +73,7 @@ def logs(folder: Path, *named: str, **mapping: object) -> Reading:
     (entry,) = opened.project.convert
     config = Configuration()
     assert logs_of(opened, entry)
-    return lambda: convert_entry(opened, entry, config.ingest, config.fix_sigma, recordings())
+    return lambda: convert_entry(opened, entry, config.ingest, config.fix_sigma, public_recordings())
 
 
 def geojson(folder: Path, trial: SmallTrial) -> Reading:

@@ -29,7 +29,7 @@ def trial(*logs: str, options: tuple[str, ...] = ()) -> int:
     """The command, or a failed test where it does not end: a pipe that nobody writes to never ends by itself."""
     arguments = ["trial", *logs, "--track", "line.geojson", "--balises", "every", "1000", *options, "--to", "p"]
     ended: list[int] = []
-    thread = threading.Thread(target=lambda: ended.append(cli._guarded(arguments, debug=False)), daemon=True)
+    thread = threading.Thread(target=lambda: ended.append(cli._run_guarded(arguments, debug=False)), daemon=True)
     thread.start()
     thread.join(60.0)
     assert ended, "it does not end"
@@ -46,7 +46,7 @@ def test_logs_of_odd_names_are_replayed(folder: Path, name: str) -> None:
         assert status == cli.USAGE
         return
     assert status == cli.OK
-    assert cli._guarded(["run", "--project", "p", "-q"], debug=False) in (cli.OK, cli.RUNS_NOT_OK)
+    assert cli._run_guarded(["run", "--project", "p", "-q"], debug=False) in (cli.OK, cli.RUNS_NOT_OK)
     assert (folder / "p/result/manifest.json").exists()
 
 
@@ -110,5 +110,5 @@ def test_links_that_lead_back_show_each_log_once(folder: Path) -> None:
 )
 def test_places_that_no_file_system_has(folder: Path, capsys: pytest.CaptureFixture[str], text: str) -> None:
     (folder / "balise.toml").write_text(f'[[convert]]\n{text}\n[[convert.logs]]\nfiles = ["logs/good.nmea"]\n')
-    assert cli._guarded(["run"], debug=False) == cli.USAGE
+    assert cli._run_guarded(["run"], debug=False) == cli.USAGE
     assert "balise.toml: convert.0.to: " in capsys.readouterr().err

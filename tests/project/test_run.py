@@ -58,7 +58,7 @@ def project(tmp_path: Path, small_trial: SmallTrial, monkeypatch: pytest.MonkeyP
 
 
 def call(*arguments: str) -> int:
-    return cli._guarded(list(arguments), debug=False)
+    return cli._run_guarded(list(arguments), debug=False)
 
 
 def states(folder: Path) -> dict[str, tuple[int, bytes]]:

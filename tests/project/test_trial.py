@@ -78,7 +78,7 @@ def raw(tmp_path: Path, small_trial: SmallTrial, monkeypatch: pytest.MonkeyPatch
 
 
 def call(*arguments: str) -> int:
-    return cli._guarded(list(arguments), debug=False)
+    return cli._run_guarded(list(arguments), debug=False)
 
 
 def written(folder: Path) -> Project:

@@ -14,10 +14,10 @@ import numpy as np
 import polars as pl
 
 from datasets.experiment.recorded.plan import Bank, Cell, RecordedPlan
-from datasets.experiment.workers import generator
+from datasets.experiment.workers import random_generator
 from datasets.inject import Recording
 from pipeline.one_run import monitor_alone
-from pipeline.stages.epochs.clock import Clock, holds, unambiguous
+from pipeline.stages.epochs.clock import Clock, holds_at_rows, unambiguous
 from pipeline.stages.evidence import TrainEvidence
 from pipeline.stages.judge.judge import judge
 from pipeline.stages.judge.judgement import JudgeInput
@@ -65,14 +65,17 @@ class Baseline:
 
     @property
     def solution(self) -> str:
+        """Name of the solution."""
         return self.monitored.solution.name
 
     @property
     def config(self) -> Configuration:
+        """The configuration of the bank."""
         return self.bank.config
 
     @cached_property
     def t_ns(self) -> Ints:
+        """Times of the epochs [ns]."""
         return times_ns(self.epochs)
 
     @cached_property
@@ -82,7 +85,7 @@ class Baseline:
         return OwnError.MEASURED if known else OwnError.ASSUMED
 
     @cached_property
-    def own_m(self) -> tuple[Floats, Floats]:
+    def own_errors_m(self) -> tuple[Floats, Floats]:
         """Least and largest own error in the direction of travel [m]; 0 where nothing in the run can say it."""
         if self.own_error is OwnError.ASSUMED:
             zero = np.zeros(self.t_ns.size)
@@ -90,42 +93,46 @@ class Baseline:
         return floats(self.epochs, "error_low_m"), floats(self.epochs, "error_high_m")
 
     @cached_property
-    def alarming(self) -> Bools:
-        """A monitor fails, or the position is negated."""
+    def are_alarming(self) -> Bools:
+        """Epochs at which a monitor fails, or the position is negated."""
         return flags(self.epochs, "alarm") | flags(self.epochs, "negated")
 
     @cached_property
     def clock(self) -> Clock:
+        """How long each epoch holds."""
         return Clock.of(self.epochs, self.config)
 
     def fault_free(self) -> FaultFree:
         """What this bank did on the run as it was recorded; no alarm can begin while one stands."""
         held_s = self.clock.held_s
-        hours = float(held_s[self.watched & ~self.alarming].sum()) / 3600.0
+        hours = float(held_s[self.have_verdict & ~self.are_alarming].sum()) / 3600.0
         tvb_s = float(held_s[flags(self.epochs, "tvb")].sum())
         return FaultFree(self.bank.name, 1, hours, self.alarms.height, tvb_s, float(held_s.sum()))
 
     @cached_property
-    def watched(self) -> Bools:
-        """Some monitor had a verdict."""
+    def have_verdict(self) -> Bools:
+        """Epochs at which some monitor had a verdict."""
         states = pl.any_horizontal(pl.col(r"^.*_state$").cast(pl.String).is_in(["pass", "fail"]))
-        return holds(self.epochs, states)
+        return holds_at_rows(self.epochs, states)
 
     def left_out(self, quiet_s: float) -> Ints:
         """Per epoch the reason (number in `LeftOut`) why no fault begins there, -1 where one may."""
         after_gap = np.diff(self.t_ns, prepend=self.t_ns[:1]) > self.clock.limit_s * NS_PER_S
         doubtful = np.zeros(self.t_ns.size, dtype=bool)
         if self.own_error is OwnError.MEASURED:
-            doubtful = ~holds(self.epochs, pl.col("judgement") == Judgement.RIGHT.value)
+            doubtful = ~holds_at_rows(self.epochs, pl.col("judgement") == Judgement.RIGHT.value)
         reason = np.full(self.t_ns.size, -1)
         for why, where in (
             (LeftOut.NOT_RIGHT, doubtful),
             (LeftOut.NO_TVB, ~flags(self.epochs, "tvb") | after_gap),
-            (LeftOut.AMBIGUOUS, ~holds(self.epochs, unambiguous()) & self.epochs["path_m"].is_not_null().to_numpy()),
-            (LeftOut.ALARM, self.alarming),
+            (
+                LeftOut.AMBIGUOUS,
+                ~holds_at_rows(self.epochs, unambiguous()) & self.epochs["path_m"].is_not_null().to_numpy(),
+            ),
+            (LeftOut.ALARM, self.are_alarming),
         ):
             reason[where] = _REASONS.index(why)
-        return _with_quiet(reason, self.t_ns, quiet_s)
+        return _leave_out_before_quiet(reason, self.t_ns, quiet_s)
 
     def satellites_at(self, t_ns: int) -> list[str]:
         """Satellites used at this epoch, in order of name."""
@@ -148,7 +155,7 @@ def instant(t_ns: int) -> pl.Expr:
     return pl.lit(t_ns).cast(pl.Datetime("ns", "UTC"))
 
 
-def _with_quiet(reason: Ints, t_ns: Ints, quiet_s: float) -> Ints:
+def _leave_out_before_quiet(reason: Ints, t_ns: Ints, quiet_s: float) -> Ints:
     """Epochs too soon after what is left out, or after the first epoch, are left out too."""
     bad_ns = np.where(reason >= 0, t_ns, t_ns[0])
     soon = t_ns - np.maximum.accumulate(bad_ns) < quiet_s * NS_PER_S
@@ -179,7 +186,7 @@ def baseline_of(run: RunLog, site: Site, vehicle: Vehicle, bank: Bank, solution:
 
 
 @frozen
-class Room:
+class OnsetRoom:
     """Where faults may begin in one run, by all banks; arrays per epoch.
 
     `left_out`: number of the reason in `LeftOut`, -1 where a fault may begin; `free_ns`: before the next alarm or
@@ -194,14 +201,14 @@ class Room:
     free_ns: Ints
     has_ranges: bool
 
-    def takes(self, cell: Cell) -> bool:
-        """The run records what the fault needs."""
+    def takes_cell(self, cell: Cell) -> bool:
+        """Whether the run records what the fault of a cell needs."""
         return self.has_ranges or not cell.hits_satellite
 
-    def eligible(self, cell: Cell) -> Bools:
+    def eligible_epochs(self, cell: Cell) -> Bools:
         """Epochs at which a fault of this cell may begin and be watched to its end."""
         watched: Bools = self.t_ns + round(cell.watch_s * NS_PER_S) <= self.free_ns
-        return watched & (self.left_out < 0) & self.takes(cell)
+        return watched & (self.left_out < 0) & self.takes_cell(cell)
 
     def longest_s(self) -> float:
         """The longest watch that some epoch allows [s]."""
@@ -216,14 +223,14 @@ class Room:
         return {**by_reason, "usable_s": float(self.held_s[self.left_out < 0].sum())}
 
 
-def room_of(baselines: Sequence[Baseline], quiet_s: float) -> Room:
+def room_of(baselines: Sequence[Baseline], quiet_s: float) -> OnsetRoom:
     """What all banks leave of a run: an epoch that one of them leaves out is left out for all."""
     first = baselines[0]
     left_out = np.max([base.left_out(quiet_s) for base in baselines], axis=0)
-    alarming = np.logical_or.reduce([base.alarming for base in baselines])
+    alarming = np.logical_or.reduce([base.are_alarming for base in baselines])
     # An alarm at the very end of a watch would be taken for one of the fault.
     ends_ns = np.where(alarming, first.t_ns - 1, first.t_ns[-1])
-    return Room(
+    return OnsetRoom(
         run_id=first.run.run_id,
         first_ns=first.recording.first_ns,
         t_ns=first.t_ns,
@@ -246,22 +253,22 @@ class Onset:
 
 
 def onsets_of(
-    rooms: Sequence[Room], cells: Sequence[Cell], plan: RecordedPlan
+    rooms: Sequence[OnsetRoom], cells: Sequence[Cell], plan: RecordedPlan
 ) -> dict[str, list[tuple[str, int, float]]]:
     """Per cell the runs, epochs and lots drawn: at most `cell.count`, fewer where there is no room for more."""
-    return {cell.name: _drawn(rooms, cell, plan) for cell in cells}
+    return {cell.name: _draw_onsets(rooms, cell, plan) for cell in cells}
 
 
-def numbered(cells: Sequence[Cell], drawn: Mapping[str, list[tuple[str, int, float]]]) -> list[Onset]:
+def number_onsets(cells: Sequence[Cell], drawn: Mapping[str, list[tuple[str, int, float]]]) -> list[Onset]:
     """All onsets, cell by cell, in order of run and time."""
     rows = [(cell, *place) for cell in cells for place in sorted(drawn[cell.name])]
     return [Onset(number, *row) for number, row in enumerate(rows)]
 
 
-def _drawn(rooms: Sequence[Room], cell: Cell, plan: RecordedPlan) -> list[tuple[str, int, float]]:
+def _draw_onsets(rooms: Sequence[OnsetRoom], cell: Cell, plan: RecordedPlan) -> list[tuple[str, int, float]]:
     """Epochs of all runs in random order, each taken unless it is too near to one of its run that was taken before."""
-    rng = generator(plan.seed, zlib.crc32(cell.name.encode()))
-    places = [np.flatnonzero(room.eligible(cell)) for room in rooms]
+    rng = random_generator(plan.seed, zlib.crc32(cell.name.encode()))
+    places = [np.flatnonzero(room.eligible_epochs(cell)) for room in rooms]
     owner = np.repeat(np.arange(len(rooms)), [rows.size for rows in places])
     rows = np.concatenate(places) if places else np.zeros(0, dtype=np.int64)
     apart_ns = round(plan.apart_s * NS_PER_S)
@@ -279,6 +286,7 @@ def _drawn(rooms: Sequence[Room], cell: Cell, plan: RecordedPlan) -> list[tuple[
 
 
 def _is_apart(taken_ns: list[int], t_ns: int, apart_ns: int) -> bool:
+    """Whether an instant is far enough from all that were taken."""
     at = bisect_left(taken_ns, t_ns)
     neighbours = taken_ns[max(at - 1, 0) : at + 1]
     return all(abs(t_ns - other) >= apart_ns for other in neighbours)

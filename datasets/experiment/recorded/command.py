@@ -18,14 +18,14 @@ from datasets.experiment.recorded.baseline import (
     Baseline,
     FaultFree,
     Onset,
-    Room,
+    OnsetRoom,
     baseline_of,
-    numbered,
+    number_onsets,
     onsets_of,
     room_of,
 )
-from datasets.experiment.recorded.outcome import injected, outcome_row
-from datasets.experiment.recorded.page import pictures, recorded_page, remarks_on
+from datasets.experiment.recorded.outcome import inject_fault, outcome_row
+from datasets.experiment.recorded.page import draw_pictures, recorded_page, remarks_on
 from datasets.experiment.recorded.plan import Bank, Cell, RecordedPlan, banks_of, load_plan
 from datasets.experiment.recorded.tables import banks_table, cells_table, places_table, pmd_table
 from datasets.experiment.tables import Row
@@ -64,7 +64,7 @@ _LOST_KEY = "balise.lost"
 _LOST = {"bank": pl.String, "cell": pl.String, "reason": pl.String}
 
 
-def _ignore(text: str) -> None:
+def _ignore_text(text: str) -> None:
     """Nobody listens."""
 
 
@@ -103,7 +103,7 @@ class _Surveyed:
     run_id: str
     row: Row
     replays_s: float = 0.0
-    room: Room | None = None
+    room: OnsetRoom | None = None
     fault_free: tuple[FaultFree, ...] = ()
     run_digest: str = ""
     error: InputError | None = None
@@ -139,7 +139,7 @@ def recorded_experiment(
     per_cell: int | None,
     solution: str,
     jobs: int,
-    say: Callable[[str], None] = _ignore,
+    say: Callable[[str], None] = _ignore_text,
 ) -> ExperimentResult:
     """Run the experiment; what is in `out` of the same inputs is not made again. Writes tables, pictures and a page.
 
@@ -150,10 +150,10 @@ def recorded_experiment(
     plan = load_plan(plan_file)
     given = {"seed": seed, "per_cell": per_cell}
     plan = plan.model_copy(update={name: value for name, value in given.items() if value is not None})
-    inputs = _inputs(runs, site, vehicle, config, solution, plan, banks_of(plan, plan_file, config))
+    inputs = _experiment_inputs(runs, site, vehicle, config, solution, plan, banks_of(plan, plan_file, config))
     # An earlier call may have found other runs at these addresses.
     _KEPT.clear()
-    surveyed = _without_copies(map_in_processes(_survey, [(inputs, run) for run in inputs.runs], jobs))
+    surveyed = _without_repeated_runs(map_in_processes(_survey_run, [(inputs, run) for run in inputs.runs], jobs))
     rooms = [one.room for one in surveyed if one.room is not None]
     if not rooms:
         raise next(one.error for one in surveyed if one.error is not None)
@@ -161,18 +161,18 @@ def recorded_experiment(
     drawn = onsets_of(rooms, cells, plan)
     _refuse_lack_of_room(cells, drawn, rooms, plan_file)
     digests = {one.run_id: one.run_digest for one in surveyed}
-    onsets = numbered(cells, drawn)
+    onsets = number_onsets(cells, drawn)
     pieces = _pieces(inputs, onsets, digests, out)
-    say(_estimate(onsets, pieces, surveyed, len(inputs.banks), jobs))
-    tables = _tables(
+    say(_estimate_work(onsets, pieces, surveyed, len(inputs.banks), jobs))
+    tables = _result_tables(
         map_in_processes(_replay_piece, pieces, jobs), surveyed, cells, plan, [bank.name for bank in inputs.banks]
     )
-    files = _write(out, tables, plan)
-    _remove_others(pieces, out)
+    files = _write_results(out, tables, plan)
+    _remove_other_pieces(pieces, out)
     return ExperimentResult(tables, {one.run_id: str(one.error) for one in surveyed if one.error is not None}, files)
 
 
-def _inputs(
+def _experiment_inputs(
     runs: Sequence[str],
     site: str,
     vehicle: Path | None,
@@ -184,18 +184,19 @@ def _inputs(
     """What the command names; the digest stands for all that decides an outcome but the run and the fault."""
     ground = read_site(site, config.site)
     settings = [(bank.name, digest_of(bank.config, load_settings(bank.vehicle or vehicle, Vehicle))) for bank in banks]
-    decides = (_own_digest(), ground.digest, digest_of(config), settings, solution, plan.quiet_s)
+    decides = (_program_digest(), ground.digest, digest_of(config), settings, solution, plan.quiet_s)
     digest = hashlib.sha256(repr(decides).encode()).hexdigest()
     return Inputs(tuple(find_runs(runs).items()), site, vehicle, config, banks, solution, plan.quiet_s, digest)
 
 
-def _survey(task: tuple[Inputs, tuple[str, str]]) -> _Surveyed:
+def _survey_run(task: tuple[Inputs, tuple[str, str]]) -> _Surveyed:
+    """One run without a fault, by all banks."""
     inputs, (run_id, address) = task
     begin_s = time.perf_counter()
     try:
-        baselines = [_baseline(inputs, address, bank) for bank in inputs.banks]
+        baselines = [_cached_baseline(inputs, address, bank) for bank in inputs.banks]
     except InputError as error:
-        return _unusable(run_id, error)
+        return _unusable_run(run_id, error)
     first = baselines[0]
     room = replace(room_of(baselines, inputs.quiet_s), run_id=run_id)
     row = {
@@ -215,7 +216,7 @@ def _survey(task: tuple[Inputs, tuple[str, str]]) -> _Surveyed:
     )
 
 
-def _estimate(
+def _estimate_work(
     onsets: Sequence[Onset], pieces: Sequence[_Piece], surveyed: Sequence[_Surveyed], banks: int, jobs: int
 ) -> str:
     """How much there is to do: each injection takes as long as its run did without a fault."""
@@ -227,20 +228,21 @@ def _estimate(
     return f"{count} injections, about {duration_text(takes_s)}" + (f"; {done} are done already" if done else "")
 
 
-def _unusable(run_id: str, error: InputError) -> _Surveyed:
+def _unusable_run(run_id: str, error: InputError) -> _Surveyed:
+    """A run that cannot be used, with the reason."""
     nothing = dict.fromkeys(ExperimentRuns.column_names())
     row = {**nothing, "run_id": run_id, "status": RunStatus.FAILED.value, "error": str(error), "injections": 0}
     return _Surveyed(run_id, row, error=error)
 
 
-def _without_copies(surveyed: Sequence[_Surveyed]) -> list[_Surveyed]:
+def _without_repeated_runs(surveyed: Sequence[_Surveyed]) -> list[_Surveyed]:
     """A copy of a run is no further pass, and no further hour."""
     first: dict[str, str] = {}
     kept = []
     for one in surveyed:
         original = first.setdefault(one.run_digest, one.run_id) if one.room is not None else one.run_id
         copy = InputError("is a copy of another run", place=one.run_id, found=f"the same bytes as {original}")
-        kept.append(one if original == one.run_id else _unusable(one.run_id, copy))
+        kept.append(one if original == one.run_id else _unusable_run(one.run_id, copy))
     return kept
 
 
@@ -248,12 +250,13 @@ _KEPT: dict[tuple[str, str, str], Baseline] = {}
 """The last run and banks of this process: it takes the pieces of a run and bank one after the other."""
 
 
-def _baseline(inputs: Inputs, address: str, bank: Bank) -> Baseline:
+def _cached_baseline(inputs: Inputs, address: str, bank: Bank) -> Baseline:
+    """A run by one bank without a fault; the last ones are kept."""
     key = (inputs.digest, address, bank.name)
     if key not in _KEPT:
         run = read_run(address, inputs.config.ingest, True)
         vehicle = load_settings(bank.vehicle or inputs.vehicle, Vehicle)
-        made = baseline_of(run, _site(inputs.site, inputs.digest, inputs.config), vehicle, bank, inputs.solution)
+        made = baseline_of(run, _cached_site(inputs.site, inputs.digest, inputs.config), vehicle, bank, inputs.solution)
         while len(_KEPT) > 1:
             _KEPT.pop(next(iter(_KEPT)))
         _KEPT[key] = made
@@ -263,7 +266,7 @@ def _baseline(inputs: Inputs, address: str, bank: Bank) -> Baseline:
 _SITES: dict[str, Site] = {}
 
 
-def _site(address: str, digest: str, config: Configuration) -> Site:
+def _cached_site(address: str, digest: str, config: Configuration) -> Site:
     """Read once by each process."""
     if digest not in _SITES:
         _SITES.clear()
@@ -272,7 +275,10 @@ def _site(address: str, digest: str, config: Configuration) -> Site:
 
 
 def _refuse_lack_of_room(
-    cells: Sequence[Cell], drawn: dict[str, list[tuple[str, int, float]]], rooms: Sequence[Room], plan_file: Path | None
+    cells: Sequence[Cell],
+    drawn: dict[str, list[tuple[str, int, float]]],
+    rooms: Sequence[OnsetRoom],
+    plan_file: Path | None,
 ) -> None:
     """A plan of the user's is done whole or not at all; the default takes what there is, and says so in `cells`."""
     if not any(drawn.values()):
@@ -281,7 +287,8 @@ def _refuse_lack_of_room(
         raise InputError(
             "no run has room for any fault of the plan",
             place=", ".join(room.run_id for room in rooms),
-            found=f"at most {longest_s:.0f} s without an alarm from an instant that may be used; {_left_out(rooms)}",
+            found=f"at most {longest_s:.0f} s without an alarm from an instant that may be used; "
+            + _left_out_words(rooms),
             expected=f"{shortest_s:.0f} s",
             remedy="Give longer runs, or runs in which less is wrong.",
         )
@@ -291,7 +298,7 @@ def _refuse_lack_of_room(
         count = len(drawn[cell.name])
         if count == cell.count:
             continue
-        if not any(room.takes(cell) for room in rooms):
+        if not any(room.takes_cell(cell) for room in rooms):
             raise ConfigError("no run has satellites beside its positions", place=f"{plan_file}: {cell.name}")
         raise ConfigError(
             "has no room for so many injections",
@@ -302,7 +309,7 @@ def _refuse_lack_of_room(
         )
 
 
-def _left_out(rooms: Sequence[Room]) -> str:
+def _left_out_words(rooms: Sequence[OnsetRoom]) -> str:
     """Time that may be used, and why the rest may not."""
     sums: dict[str, float] = {}
     for room in rooms:
@@ -315,7 +322,7 @@ def _pieces(inputs: Inputs, onsets: Sequence[Onset], digests: dict[str, str], ou
     """Pieces by run and bank, so that a process prepares each as rarely as can be."""
     addresses = dict(inputs.runs)
     return [
-        _piece(inputs, addresses[run_id], bank, rows[at : at + _PIECE], digests[run_id], out)
+        _piece_of(inputs, addresses[run_id], bank, rows[at : at + _PIECE], digests[run_id], out)
         for run_id in sorted({onset.run_id for onset in onsets})
         for bank in inputs.banks
         for rows in [[onset for onset in onsets if onset.run_id == run_id]]
@@ -323,7 +330,8 @@ def _pieces(inputs: Inputs, onsets: Sequence[Onset], digests: dict[str, str], ou
     ]
 
 
-def _piece(inputs: Inputs, address: str, bank: Bank, onsets: Sequence[Onset], run_digest: str, out: Path) -> _Piece:
+def _piece_of(inputs: Inputs, address: str, bank: Bank, onsets: Sequence[Onset], run_digest: str, out: Path) -> _Piece:
+    """Some injections of one run and bank, in a file that is named after all that decides them."""
     made_of = (inputs.digest, run_digest, bank.name, [(one.number, one.cell, one.t_ns, one.lot) for one in onsets])
     name = hashlib.sha256(repr(made_of).encode()).hexdigest()
     return _Piece(inputs, address, bank, tuple(onsets), out / _PIECES / f"{name}.parquet")
@@ -334,12 +342,12 @@ def _replay_piece(piece: _Piece) -> Part:
     content = storage.content_of(piece.file)
     if content is not None:
         return _read_part(content)
-    base = _baseline(piece.inputs, piece.address, piece.bank)
+    base = _cached_baseline(piece.inputs, piece.address, piece.bank)
     rows: list[Row] = []
     lost: list[tuple[str, str, str]] = []
     for onset in piece.onsets:
         try:
-            found = injected(base, onset)
+            found = inject_fault(base, onset)
         except InputError as error:
             lost.append((piece.bank.name, onset.cell.name, str(error)))
             continue
@@ -350,19 +358,21 @@ def _replay_piece(piece: _Piece) -> Part:
 
 
 def _read_part(content: bytes) -> Part:
+    """What became of the injections of a piece, from its file."""
     table = pq.read_table(io.BytesIO(content))
     lost = json.loads((table.schema.metadata or {})[_LOST_KEY.encode()])
     frame = pl.read_parquet(io.BytesIO(content))
     return Part(conform(frame, ExperimentInjections), tuple((bank, cell, why) for bank, cell, why in lost))
 
 
-def _tables(
+def _result_tables(
     parts: Sequence[Part],
     surveyed: Sequence[_Surveyed],
     cells: Sequence[Cell],
     plan: RecordedPlan,
     banks: Sequence[str],
 ) -> dict[str, pl.DataFrame]:
+    """All tables of the experiment."""
     frames = [part.frame for part in parts]
     injections = pl.concat(frames) if frames else ExperimentInjections.create_empty()
     order = pl.col("bank").replace_strict({name: number for number, name in enumerate(banks)}, return_dtype=pl.Int64)
@@ -382,14 +392,15 @@ def _tables(
 
 
 def _sum_over_runs(bank: str, surveyed: Sequence[_Surveyed]) -> FaultFree:
-    """All runs without a fault, as this bank saw them."""
+    """What a bank did on all runs without a fault."""
     parts = [part for one in surveyed for part in one.fault_free if part.bank == bank]
     sums = {name: sum(getattr(part, name) for part in parts) for name in ("hours", "alarms", "tvb_s", "recorded_s")}
     return FaultFree(bank=bank, runs=len(parts), **sums)
 
 
-def _write(out: Path, tables: dict[str, pl.DataFrame], plan: RecordedPlan) -> list[Path]:
-    drawn = pictures(tables)
+def _write_results(out: Path, tables: dict[str, pl.DataFrame], plan: RecordedPlan) -> list[Path]:
+    """Write tables, pictures and page; returns the files."""
+    drawn = draw_pictures(tables)
     contents = {PAGE: recorded_page(tables, drawn, plan).encode(), "plan.toml": to_toml(plan).encode()}
     for name, frame in tables.items():
         notes = {"table": f"experiment_{name}", "software": SOFTWARE}
@@ -400,7 +411,7 @@ def _write(out: Path, tables: dict[str, pl.DataFrame], plan: RecordedPlan) -> li
     return [out / name for name in contents]
 
 
-def _remove_others(pieces: Sequence[_Piece], out: Path) -> None:
+def _remove_other_pieces(pieces: Sequence[_Piece], out: Path) -> None:
     """Pieces of other plans, or of other inputs, go."""
     kept = {piece.file.name for piece in pieces}
     for file in (out / _PIECES).glob("*.parquet"):
@@ -409,7 +420,7 @@ def _remove_others(pieces: Sequence[_Piece], out: Path) -> None:
 
 
 @cache
-def _own_digest() -> str:
+def _program_digest() -> str:
     """Of the program and of what puts the faults in."""
     digest = hashlib.sha256(software_digest().encode())
     for source in sorted(Path(__file__).parents[2].rglob("*.py")):
@@ -417,7 +428,7 @@ def _own_digest() -> str:
     return digest.hexdigest()
 
 
-def shown(made: ExperimentResult) -> dict[str, pl.DataFrame]:
+def tables_for_screen(made: ExperimentResult) -> dict[str, pl.DataFrame]:
     """What the screen shows: cells that were replayed, and banks."""
     cells = made.tables["cells"].filter(pl.col("injections") > 0)
     return {"Cells": cells.select(_SHOWN), "Banks": made.tables["banks"].select(_SHOWN_OF_BANKS)}

@@ -34,7 +34,7 @@ _LASTING_S = 1.0
 
 
 @frozen
-class Injected:
+class InjectedFault:
     """The fault as a fault file of `balise inject` would hold it, and what the train made of it."""
 
     fault: FaultSpec
@@ -42,66 +42,80 @@ class Injected:
     end_ns: int
 
 
-def injected(base: Baseline, onset: Onset) -> Injected:
+def inject_fault(base: Baseline, onset: Onset) -> InjectedFault:
     """Put the fault in and replay. Raises `InputError` where the recording cannot take it there."""
     cell = onset.cell
     start_s = (onset.t_ns - base.recording.first_ns) / NS_PER_S
-    fault = cell.spec(start_s, _satellite(base, onset) if cell.hits_satellite else None)
+    fault = cell.spec(start_s, _drawn_satellite(base, onset) if cell.hits_satellite else None)
     end_ns = onset.t_ns + round(cell.watch_s * NS_PER_S)
-    faulty = _odometer_hit(base, fault, end_ns) if cell.hits_odometer else _gnss_hit(base, fault, onset.t_ns, end_ns)
+    faulty = (
+        _with_odometer_fault(base, fault, end_ns)
+        if cell.hits_odometer
+        else _with_gnss_fault(base, fault, onset.t_ns, end_ns)
+    )
     # The monitor that compares two solutions needs both.
     named = (base.solution, base.config.monitors.channel_reference)
     matches = {name: faulty.match(name) for name in faulty.run.solutions() if name in named}
-    return Injected(fault, monitor_solution(faulty, base.solution, matches, base.evidence), end_ns)
+    return InjectedFault(fault, monitor_solution(faulty, base.solution, matches, base.evidence), end_ns)
 
 
-def _satellite(base: Baseline, onset: Onset) -> str:
+def _drawn_satellite(base: Baseline, onset: Onset) -> str:
+    """The satellite that an onset draws among those used; raises `InputError` where none is."""
     used = base.satellites_at(onset.t_ns)
     if not used:
         raise InputError("has no used satellite at the instant drawn", place=f"{onset.run_id}: satellites")
     return used[int(onset.lot * len(used))]
 
 
-def _gnss_hit(base: Baseline, fault: FaultSpec, begin_ns: int, end_ns: int) -> PreparedRun:
+def _with_gnss_fault(base: Baseline, fault: FaultSpec, begin_ns: int, end_ns: int) -> PreparedRun:
     """Positions and ranges as cleaned, the fault added from its first epoch on; odometer and reads as they were."""
     run = base.monitored.prepared.run
     # A late position is one of before the fault.
     from_ns = base.recording.first_ns if fault.kind is FaultKind.LATENCY else begin_ns
-    tail = run.with_streams(gnss=_between(run.gnss, from_ns, end_ns), satellites=_cut(run.satellites, begin_ns, end_ns))
+    tail = run.with_streams(
+        gnss=_rows_between(run.gnss, from_ns, end_ns), satellites=_cut_stream(run.satellites, begin_ns, end_ns)
+    )
     hit = inject(tail, fault, base.site, base.recording)
     streams = {
-        "gnss": pl.concat([_before(run.gnss, begin_ns), _between(hit.gnss, begin_ns, end_ns)]),
-        "satellites": None if run.satellites is None else _append_hit(run.satellites, hit.satellites, begin_ns),
+        "gnss": pl.concat([_rows_before(run.gnss, begin_ns), _rows_between(hit.gnss, begin_ns, end_ns)]),
+        "satellites": None if run.satellites is None else _replace_from(run.satellites, hit.satellites, begin_ns),
     }
     return replace(base.monitored.prepared, run=run.with_streams(**streams))
 
 
-def _odometer_hit(base: Baseline, fault: FaultSpec, end_ns: int) -> PreparedRun:
+def _with_odometer_fault(base: Baseline, fault: FaultSpec, end_ns: int) -> PreparedRun:
     """All odometers with the fault; positions as recorded, to the end of the watch."""
     prepared = base.monitored.prepared
     first_ns = base.recording.first_ns
     hit = inject(base.run, fault, base.site, base.recording)
     cut = RunLog.with_streams(
-        hit, gnss=_between(hit.gnss, first_ns, end_ns), satellites=_cut(hit.satellites, first_ns, end_ns), faults=None
+        hit,
+        gnss=_rows_between(hit.gnss, first_ns, end_ns),
+        satellites=_cut_stream(hit.satellites, first_ns, end_ns),
+        faults=None,
     )
     return prepare(cut, base.site, prepared.vehicle, prepared.config, clock_advice)
 
 
-def _append_hit(recorded: pl.DataFrame, hit: pl.DataFrame | None, begin_ns: int) -> pl.DataFrame:
-    before = _before(recorded, begin_ns)
+def _replace_from(recorded: pl.DataFrame, hit: pl.DataFrame | None, begin_ns: int) -> pl.DataFrame:
+    """The recorded rows before an instant, and the faulty ones after it."""
+    before = _rows_before(recorded, begin_ns)
     return before if hit is None else pl.concat([before, hit])
 
 
-def _before(frame: pl.DataFrame, begin_ns: int) -> pl.DataFrame:
+def _rows_before(frame: pl.DataFrame, begin_ns: int) -> pl.DataFrame:
+    """Rows before an instant."""
     return frame.filter(pl.col("t") < instant(begin_ns))
 
 
-def _between(frame: pl.DataFrame, begin_ns: int, end_ns: int) -> pl.DataFrame:
+def _rows_between(frame: pl.DataFrame, begin_ns: int, end_ns: int) -> pl.DataFrame:
+    """Rows from one instant to another."""
     return frame.filter(pl.col("t").is_between(instant(begin_ns), instant(end_ns)))
 
 
-def _cut(frame: pl.DataFrame | None, begin_ns: int, end_ns: int) -> pl.DataFrame | None:
-    return None if frame is None else _between(frame, begin_ns, end_ns)
+def _cut_stream(frame: pl.DataFrame | None, begin_ns: int, end_ns: int) -> pl.DataFrame | None:
+    """A stream from one instant to another, if it is there."""
+    return None if frame is None else _rows_between(frame, begin_ns, end_ns)
 
 
 @frozen
@@ -120,65 +134,69 @@ class Watch:
 
     @property
     def t_ns(self) -> Ints:
+        """Times of the epochs [ns]."""
         return self.epochs.t_ns
 
 
-def outcome_row(base: Baseline, onset: Onset, found: Injected) -> Row:
+def outcome_row(base: Baseline, onset: Onset, found: InjectedFault) -> Row:
     """The row of `schemas.experiment.Injections`, but for the bank."""
-    watch = _watch(base, onset, found)
+    watch = _watch_epochs(base, onset, found)
     after = watch.t_ns >= onset.t_ns
     alarm = watch.epochs.alarm & after
     noticed_ns = int(watch.t_ns[alarm.argmax()]) if alarm.any() else None
-    failure_ns, may_ns = _failure(watch)
+    failure_ns, may_ns = _first_failures(watch)
     use = time_in_use(watch.epochs, watch.code, base.config)
     in_use = use.in_use & after
     delays_ns = reactions_ns(watch.t_ns, watch.t_ns, base.config)
     stopped_from = np.inf if noticed_ns is None else noticed_ns + int(delays_ns[alarm.argmax()])
     unnoticed = after if noticed_ns is None else after & (watch.t_ns < noticed_ns)
     return {
-        **_what(onset, found),
-        **_where(base, onset),
+        **_fault_columns(onset, found),
+        **_place_columns(base, onset),
         "t_onset": onset.t_ns,
         "watched_s": (found.end_ns - onset.t_ns) / NS_PER_S,
         "noticed": noticed_ns is not None,
-        "monitors": _failing(watch, int(alarm.argmax())) if noticed_ns is not None else [],
-        "time_to_detect_s": _seconds(noticed_ns, onset.t_ns),
-        "time_to_failure_s": _seconds(failure_ns, onset.t_ns),
-        "time_to_failure_may_s": _seconds(may_ns, onset.t_ns),
-        "time_since_failure_s": _seconds(noticed_ns, failure_ns),
-        "time_since_failure_may_s": _seconds(noticed_ns, may_ns),
-        "stopped": _stopped(watch, use.in_use, stopped_from) if noticed_ns is not None else None,
+        "monitors": _failing_monitors(watch, int(alarm.argmax())) if noticed_ns is not None else [],
+        "time_to_detect_s": _seconds_between(noticed_ns, onset.t_ns),
+        "time_to_failure_s": _seconds_between(failure_ns, onset.t_ns),
+        "time_to_failure_may_s": _seconds_between(may_ns, onset.t_ns),
+        "time_since_failure_s": _seconds_between(noticed_ns, failure_ns),
+        "time_since_failure_may_s": _seconds_between(noticed_ns, may_ns),
+        "stopped": _is_stopped(watch, use.in_use, stopped_from) if noticed_ns is not None else None,
         "hazardous_s": float(use.wrong_s[after].sum()),
         "hazardous_may_s": float(use.used_s[after & (watch.code != RIGHT)].sum()),
-        "unnoticed_m": _largest(watch.moved_m, unnoticed),
-        "in_use_m": _largest(watch.moved_m, in_use),
+        "unnoticed_m": _largest_movement_m(watch.moved_m, unnoticed),
+        "in_use_m": _largest_movement_m(watch.moved_m, in_use),
         "tvb_lost_s": _tvb_lost_s(base, watch, onset, found.end_ns),
-        **_accepted(base, onset, found),
+        **_acceptance_columns(base, onset, found),
     }
 
 
-def _watch(base: Baseline, onset: Onset, found: Injected) -> Watch:
+def _watch_epochs(base: Baseline, onset: Onset, found: InjectedFault) -> Watch:
+    """The epochs of the injected run, compared with those of the fault-free one."""
     lead_ns = onset.t_ns - round(_LEAD_S * NS_PER_S)
     epochs = found.monitored.solution.epochs
     epochs = epochs.where(np.flatnonzero(epochs.t_ns >= lead_ns))
     t_ns = epochs.t_ns
     row = np.searchsorted(base.t_ns, t_ns).clip(max=base.t_ns.size - 1)
     same = base.t_ns[row] == t_ns
-    moved_m, astray = _moved_m(base, epochs.element_by(base.monitored.match.path.track.index), epochs.measure_m, row)
+    moved_m, astray = _movement_by_fault_m(
+        base, epochs.element_by(base.monitored.match.path.track.index), epochs.measure_m, row
+    )
     moved_m = np.where(same, moved_m, np.nan)
-    code = _codes(base, row, moved_m, astray & epochs.unambiguous)
-    was_right = _codes(base, row, np.zeros(row.size), np.zeros(row.size, dtype=bool)) == RIGHT
+    code = _judgement_codes(base, row, moved_m, astray & epochs.unambiguous)
+    was_right = _judgement_codes(base, row, np.zeros(row.size), np.zeros(row.size, dtype=bool)) == RIGHT
     beyond = np.abs(moved_m) > base.config.hazards.limits.failure_m
     doubtful = (code == UNKNOWN) & np.isfinite(moved_m) & (was_right | beyond)
     return Watch(epochs, moved_m, code, doubtful, int(np.searchsorted(t_ns, onset.t_ns)))
 
 
-def _codes(base: Baseline, row: Ints, moved_m: Floats, astray: Bools) -> Ints:
+def _judgement_codes(base: Baseline, row: Ints, moved_m: Floats, astray: Bools) -> Ints:
     """Judgement of positions at these rows of the fault-free run that the fault has moved; wrong where `astray`.
 
     The error is an interval: the position's own, by its evidence, and what the fault has added.
     """
-    low_m, high_m = (own_m[row] + moved_m for own_m in base.own_m)
+    low_m, high_m = (own_m[row] + moved_m for own_m in base.own_errors_m)
     limit_m = base.config.hazards.limits.failure_m
     code = np.full(row.size, UNKNOWN)
     # Comparisons with NaN, an error not known, are false.
@@ -187,7 +205,7 @@ def _codes(base: Baseline, row: Ints, moved_m: Floats, astray: Bools) -> Ints:
     return code
 
 
-def _moved_m(base: Baseline, number: Ints, measure_m: Floats, row: Ints) -> tuple[Floats, Bools]:
+def _movement_by_fault_m(base: Baseline, number: Ints, measure_m: Floats, row: Ints) -> tuple[Floats, Bools]:
     """By what positions lie further along the fault-free run's path [m]; and where they lie off that path.
 
     `number`: of the net element, -1 for none; `row`: the epoch of the fault-free run.
@@ -203,7 +221,7 @@ def _moved_m(base: Baseline, number: Ints, measure_m: Floats, row: Ints) -> tupl
     return (at_m - near_m) * sense, (number >= 0) & np.isfinite(near_m) & ~np.isfinite(at_m)
 
 
-def _failure(watch: Watch) -> tuple[int | None, int | None]:
+def _first_failures(watch: Watch) -> tuple[int | None, int | None]:
     """The first wrong epoch of a second of them, else the first (DOMAIN section 5.3); and the first that may be.
 
     The latter: the first of the unbroken unknown or wrong epochs that lead there; where none is certainly wrong, the
@@ -222,16 +240,18 @@ def _failure(watch: Watch) -> tuple[int | None, int | None]:
     return int(watch.t_ns[first]), int(watch.t_ns[may])
 
 
-def _stopped(watch: Watch, in_use: Bools, from_ns: float) -> bool:
+def _is_stopped(watch: Watch, in_use: Bools, from_ns: float) -> bool:
     """After the reaction to the first alarm a wrong position was in use no more."""
     return not bool((in_use & (watch.code == WRONG) & (watch.t_ns > from_ns)).any())
 
 
-def _failing(watch: Watch, epoch: int) -> list[str]:
+def _failing_monitors(watch: Watch, epoch: int) -> list[str]:
+    """Monitors that fail at an epoch."""
     return [name for name in MONITORS if watch.epochs.verdicts[name].fails[epoch]]
 
 
-def _largest(moved_m: Floats, where: Bools) -> float:
+def _largest_movement_m(moved_m: Floats, where: Bools) -> float:
+    """The largest movement at some epochs [m]."""
     return float(np.abs(moved_m[where & np.isfinite(moved_m)]).max(initial=0.0))
 
 
@@ -244,18 +264,18 @@ def _tvb_lost_s(base: Baseline, watch: Watch, onset: Onset, end_ns: int) -> floa
     return len(had - has) * period_s
 
 
-def _accepted(base: Baseline, onset: Onset, found: Injected) -> Row:
+def _acceptance_columns(base: Baseline, onset: Onset, found: InjectedFault) -> Row:
     """Balises accepted since the onset, and of them those whose position was wrong there, or may have been."""
     crossings = found.monitored.solution.crossings
     accepted = np.flatnonzero(crossings.accepted & (crossings.t_ns >= onset.t_ns))
     t_ns = crossings.t_ns[accepted]
     row = np.searchsorted(base.t_ns, t_ns).clip(max=base.t_ns.size - 1)
-    train_m, sense = _train_at(base, t_ns, row)
+    train_m, sense = _fault_free_place(base, t_ns, row)
     index = base.monitored.match.path.track.index
     elements = [index.get(crossings.netelement_id[number], -1) for number in accepted.tolist()]
-    at_m, astray = _moved_m(base, np.array(elements, dtype=np.int64), crossings.measure_m[accepted], row)
+    at_m, astray = _movement_by_fault_m(base, np.array(elements, dtype=np.int64), crossings.measure_m[accepted], row)
     at_m = at_m * sense + floats(base.epochs, "path_m")[row]
-    code = _codes(base, row, (at_m - train_m) * sense, astray)
+    code = _judgement_codes(base, row, (at_m - train_m) * sense, astray)
     wrong = accepted[code == WRONG]
     return {
         "accepted": accepted.size,
@@ -265,7 +285,7 @@ def _accepted(base: Baseline, onset: Onset, found: Injected) -> Row:
     }
 
 
-def _train_at(base: Baseline, t_ns: Ints, row: Ints) -> tuple[Floats, Ints]:
+def _fault_free_place(base: Baseline, t_ns: Ints, row: Ints) -> tuple[Floats, Ints]:
     """Where the fault-free position was on its path at these times [m], and the direction of travel."""
     path_m = floats(base.epochs, "path_m")
     known = np.isfinite(path_m)
@@ -273,7 +293,8 @@ def _train_at(base: Baseline, t_ns: Ints, row: Ints) -> tuple[Floats, Ints]:
     return at_m, ints(base.epochs["direction"], 1)[row]
 
 
-def _what(onset: Onset, found: Injected) -> Row:
+def _fault_columns(onset: Onset, found: InjectedFault) -> Row:
+    """Columns of which fault it was."""
     return {
         **onset.cell.labels,
         "injection_id": onset.number,
@@ -285,7 +306,7 @@ def _what(onset: Onset, found: Injected) -> Row:
     }
 
 
-def _where(base: Baseline, onset: Onset) -> Row:
+def _place_columns(base: Baseline, onset: Onset) -> Row:
     """The place and what the bank knew there, in the fault-free run."""
     epoch = base.epochs.row(int(np.searchsorted(base.t_ns, onset.t_ns)), named=True)
     fixes = base.monitored.solution.fixes
@@ -295,5 +316,6 @@ def _where(base: Baseline, onset: Onset) -> Row:
     return {name: epoch[name] for name in kept} | {"satellites": satellites[0] if satellites else None} | thresholds
 
 
-def _seconds(until_ns: int | None, since_ns: int | None) -> float | None:
+def _seconds_between(until_ns: int | None, since_ns: int | None) -> float | None:
+    """Time from one instant to another [s]; None where either is not known."""
     return None if until_ns is None or since_ns is None else (until_ns - since_ns) / NS_PER_S

@@ -39,26 +39,27 @@ _LIMITS = (
 )
 
 
-def pictures(tables: dict[str, pl.DataFrame]) -> dict[str, tuple[str, str]]:
+def draw_pictures(tables: dict[str, pl.DataFrame]) -> dict[str, tuple[str, str]]:
     """Title and SVG by name of the file, without its ending."""
     ramps = pl.col("kind") == FaultKind.RAMP.value
     drawn: dict[str, tuple[str, str]] = {}
     for (bank,), pmd in tables["pmd"].filter(ramps).group_by("bank", maintain_order=True):
         for (target,), part in pmd.group_by("target", maintain_order=True):
             title = f"Pmd over the time since failure: ramps, {_TARGETS.get(str(target), target)}, {bank}"
-            drawn[f"pmd_{bank}_{target}"] = title, _pmd(title, part)
+            drawn[f"pmd_{bank}_{target}"] = title, _pmd_svg(title, part)
     for (target,), part in (
         tables["cells"].filter(ramps, pl.col("injections") > 0).group_by("target", maintain_order=True)
     ):
         title = f"T_D over the rate: ramps, {_TARGETS.get(str(target), target)}"
-        drawn[f"time_to_detect_{target}"] = title, _time_to_detect(title, part)
+        drawn[f"time_to_detect_{target}"] = title, _detection_svg(title, part)
     for (bank,), places in tables["places"].group_by("bank", maintain_order=True):
         title = f"The line: largest unnoticed error (upper lane) and slowness of detection (lower lane), {bank}"
-        drawn[f"line_{bank}"] = title, _line(title, places)
+        drawn[f"line_{bank}"] = title, _line_svg(title, places)
     return drawn
 
 
-def _pmd(title: str, pmd: pl.DataFrame) -> str:
+def _pmd_svg(title: str, pmd: pl.DataFrame) -> str:
+    """Pmd over the time since failure, a curve per amount."""
     rates = sorted(pmd["amount"].abs().unique().to_list())
     curves = [
         Curve(
@@ -73,7 +74,8 @@ def _pmd(title: str, pmd: pl.DataFrame) -> str:
     return pmd_plot(title, curves)
 
 
-def _time_to_detect(title: str, cells: pl.DataFrame) -> str:
+def _detection_svg(title: str, cells: pl.DataFrame) -> str:
+    """Time to detect over the rate."""
     curves = list(_detection_curves(cells))
     rates = cells["amount"].abs().unique().sort().to_list()
     longest_s = float(cells["watched_s"].max())  # type: ignore[arg-type]
@@ -106,7 +108,7 @@ def _detection_curves(cells: pl.DataFrame) -> Iterator[Curve]:
         )
 
 
-def _line(title: str, places: pl.DataFrame) -> str:
+def _line_svg(title: str, places: pl.DataFrame) -> str:
     """A strip of two lanes per net element."""
     rows: dict[str, list[Piece]] = {}
     for row in places.iter_rows(named=True):
@@ -126,8 +128,8 @@ def recorded_page(tables: Mapping[str, pl.DataFrame], drawn: Mapping[str, tuple[
     cells = tables["cells"]
     body = "\n".join(
         [
-            section("limits", "What this does not prove", _list(remarks_on(tables))),
-            section("pictures", "Pictures", *(_figure(name, *picture) for name, picture in drawn.items())),
+            section("limits", "What this does not prove", _html_list(remarks_on(tables))),
+            section("pictures", "Pictures", *(_figure_html(name, *picture) for name, picture in drawn.items())),
             section(
                 "banks",
                 "Banks",
@@ -158,9 +160,11 @@ def remarks_on(tables: Mapping[str, pl.DataFrame]) -> list[str]:
     return remarks
 
 
-def _list(texts: list[str]) -> str:
+def _html_list(texts: list[str]) -> str:
+    """Sentences as a list of HTML."""
     return f'<ul class="notice">{"".join(f"<li>{escape(text)}</li>" for text in texts)}</ul>'
 
 
-def _figure(name: str, title: str, drawing: str) -> str:
+def _figure_html(name: str, title: str, drawing: str) -> str:
+    """A picture with its title."""
     return f'<figure id="{escape(name)}"><figcaption><h3>{escape(title)}</h3></figcaption>{drawing}</figure>'

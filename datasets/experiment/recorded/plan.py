@@ -70,7 +70,8 @@ class PlannedFault(Settings):
     solution: str | None = None
 
     @model_validator(mode="after")
-    def _names_its_amounts(self) -> Self:
+    def _require_amounts(self) -> Self:
+        """A fault names the amounts of its kind, and no others."""
         if self.kind not in _AMOUNTS:
             raise ValueError(f"a plan takes faults of kind {', '.join(_AMOUNTS)}; found {self.kind.value}")
         wanted = _AMOUNTS[self.kind][0]
@@ -88,6 +89,7 @@ class PlannedFault(Settings):
 
     @property
     def unit(self) -> str:
+        """Unit of the amounts."""
         return _AMOUNTS[self.kind][2]
 
     def spec(self, amount: float, start_s: float, satellite: str | None) -> FaultSpec:
@@ -132,7 +134,8 @@ class RecordedPlan(Settings):
     banks: tuple[PlannedBank, ...] = ()
 
     @model_validator(mode="after")
-    def _names_are_unique(self) -> Self:
+    def _require_unique_names(self) -> Self:
+        """Every fault and every bank has a name of its own."""
         for what, names in (
             ("faults", [cell.name for cell in self.cells(20.0)]),
             ("banks", [b.name for b in self.banks]),
@@ -144,7 +147,7 @@ class RecordedPlan(Settings):
 
     def cells(self, limit_m: float) -> tuple[Cell, ...]:
         """Every fault, amount and direction; `limit_m`: the error that is a failure."""
-        return tuple(cell for fault in self.faults for cell in _cells(self, fault, limit_m))
+        return tuple(cell for fault in self.faults for cell in _cells_of_fault(self, fault, limit_m))
 
 
 @frozen
@@ -165,7 +168,7 @@ class Cell:
     @property
     def direction(self) -> str | None:
         """Where it moves the position, or the range; None where the fault has no direction."""
-        return _direction(self.fault, self.target, self.amount)
+        return _direction_word(self.fault, self.target, self.amount)
 
     @property
     def labels(self) -> dict[str, object]:
@@ -175,16 +178,17 @@ class Cell:
 
     @property
     def hits_satellite(self) -> bool:
-        """It hits the range of one satellite, drawn for each injection."""
+        """Whether it hits the range of one satellite, drawn for each injection."""
         return self.fault.target == SATELLITE
 
     @property
     def hits_odometer(self) -> bool:
+        """Whether the fault is one of the odometer."""
         return self.spec(1.0, "G01").hits_odometer
 
     @property
     def target(self) -> str:
-        """As in a fault file, or `satellite`."""
+        """What the fault acts on, as in a fault file, or `satellite`."""
         return SATELLITE if self.hits_satellite else self.spec(1.0, None).target
 
     def spec(self, start_s: float, satellite: str | None) -> FaultSpec:
@@ -192,13 +196,14 @@ class Cell:
         return self.fault.spec(self.amount, start_s, satellite)
 
 
-def _cells(plan: RecordedPlan, fault: PlannedFault, limit_m: float) -> Iterator[Cell]:
+def _cells_of_fault(plan: RecordedPlan, fault: PlannedFault, limit_m: float) -> Iterator[Cell]:
+    """A cell for each amount and direction of a fault."""
     signs = (1.0, -1.0) if fault.both_ways and fault.kind in _SIGNED else (1.0,)
     for amount in fault.amounts:
         for sign in signs:
             target = SATELLITE if fault.target == SATELLITE else fault.spec(amount, 1.0, "G01").target
             words = [fault.kind.value, target, f"{amount:g} {fault.unit}"]
-            direction = _direction(fault, target, sign)
+            direction = _direction_word(fault, target, sign)
             words += [] if direction is None else [direction]
             words += [f"for {fault.duration_s:g} s"] if fault.duration_s is not None else []
             words += [f"in {fault.solution}"] if fault.solution is not None else []
@@ -207,18 +212,20 @@ def _cells(plan: RecordedPlan, fault: PlannedFault, limit_m: float) -> Iterator[
                 fault=fault,
                 amount=sign * amount,
                 count=fault.per_cell or plan.per_cell,
-                watch_s=_watch_s(plan, fault, amount, limit_m),
+                watch_s=_watch_length_s(plan, fault, amount, limit_m),
             )
 
 
-def _direction(fault: PlannedFault, target: str, amount: float) -> str | None:
+def _direction_word(fault: PlannedFault, target: str, amount: float) -> str | None:
+    """The direction of a fault in a word; None where it has none."""
     if fault.kind not in _SIGNED:
         return None
     more, less = _DIRECTIONS.get(target, ("longer", "shorter"))
     return more if amount > 0.0 else less
 
 
-def _watch_s(plan: RecordedPlan, fault: PlannedFault, amount: float, limit_m: float) -> float:
+def _watch_length_s(plan: RecordedPlan, fault: PlannedFault, amount: float, limit_m: float) -> float:
+    """How long a fault is watched [s]: until it alone has moved the position by the failure limit."""
     if fault.watch_s is not None:
         return min(fault.watch_s, plan.longest_s)
     grows_s = 0.0

@@ -29,14 +29,14 @@ _QUANTILES = {"median": 0.5, "p95": 0.95, "max": 1.0}
 _ROUNDING = 1e-9
 
 
-class Passes(NamedTuple):
+class IndependentPasses(NamedTuple):
     """Independent passes: their number, and the number of passes of equal size that they are worth."""
 
     number: int
     worth: float
 
 
-def passes(frame: pl.DataFrame, pass_s: float) -> Passes:
+def independent_passes(frame: pl.DataFrame, pass_s: float) -> IndependentPasses:
     """The largest number of watches that share no time, at least `pass_s` each: of those left the first to end.
 
     Passes of m injections each, with all that overlap, are worth (sum m)^2 / sum m^2 (Kish's effective sample size).
@@ -55,7 +55,7 @@ def passes(frame: pl.DataFrame, pass_s: float) -> Passes:
             current[run] = len(sizes)
             sizes.append(0)
         sizes[current[run]] += 1
-    return Passes(len(sizes), sum(sizes) ** 2 / sum(size**2 for size in sizes) if sizes else 0.0)
+    return IndependentPasses(len(sizes), sum(sizes) ** 2 / sum(size**2 for size in sizes) if sizes else 0.0)
 
 
 def bounded_share(name: str, hits: int, trials: int, worth: float) -> Row:
@@ -89,10 +89,11 @@ def cells_table(
 
 
 def _cell_row(cell: Cell, bank: str, frame: pl.DataFrame, lost: pl.DataFrame, plan: RecordedPlan) -> Row:
+    """Figures of one cell by one bank."""
     noticed = int(frame["noticed"].sum())
-    independent = passes(frame, plan.pass_s)
-    failed = _failed(frame)
-    missed = _missed(failed, 0.0, "time_since_failure_may_s")
+    independent = independent_passes(frame, plan.pass_s)
+    failed = _failed_positions(frame)
+    missed = _count_missed(failed, 0.0, "time_since_failure_may_s")
     short = cell.count - frame.height - lost.height
     reason = f"{short} found no room in the runs" if short else None
     return {
@@ -106,10 +107,10 @@ def _cell_row(cell: Cell, bank: str, frame: pl.DataFrame, lost: pl.DataFrame, pl
         "passes": independent.number,
         "noticed": noticed,
         **bounded_share("noticed_share", noticed, frame.height, independent.worth),
-        **_time_to_detect(frame, int(independent.worth)),
+        **_detection_figures(frame, int(independent.worth)),
         "failures": failed.height,
         "missed_at_failure": missed,
-        **bounded_share("pmd_at_failure", missed, failed.height, passes(failed, plan.pass_s).worth),
+        **bounded_share("pmd_at_failure", missed, failed.height, independent_passes(failed, plan.pass_s).worth),
         "stopped": int(frame["stopped"].sum()),
         "noticed_not_stopped": int((~frame["stopped"].drop_nulls()).sum()),
         "accepted_wrong": int(frame["accepted_wrong"].sum()),
@@ -120,15 +121,15 @@ def _cell_row(cell: Cell, bank: str, frame: pl.DataFrame, lost: pl.DataFrame, pl
     }
 
 
-def _time_to_detect(frame: pl.DataFrame, independent: int) -> Row:
+def _detection_figures(frame: pl.DataFrame, independent: int) -> Row:
     """Quantiles of T_D; the median's bounds by order statistics of the passes."""
     times_s = np.sort(frame["time_to_detect_s"].fill_null(np.inf).to_numpy())
-    bounds = _median_bounds(times_s, independent)
+    bounds = _median_bounds_s(times_s, independent)
     quantiles = {f"time_to_detect_{name}_s": _quantile(times_s, share) for name, share in _QUANTILES.items()}
     return {**quantiles, "time_to_detect_median_low_s": bounds[0], "time_to_detect_median_high_s": bounds[1]}
 
 
-def _median_bounds(times_s: Floats, independent: int) -> tuple[float | None, float | None]:
+def _median_bounds_s(times_s: Floats, independent: int) -> tuple[float | None, float | None]:
     """None of fewer than six passes: the least and the largest of five enclose the median with 93.75 % only."""
     from scipy.stats import binom  # takes half a second to load
 
@@ -148,14 +149,15 @@ def _quantile(ordered: Floats, share: float) -> float | None:
     return value if np.isfinite(value) else None
 
 
-def _failed(frame: pl.DataFrame) -> pl.DataFrame:
+def _failed_positions(frame: pl.DataFrame) -> pl.DataFrame:
     """Positions that certainly failed, and those that may have and were not noticed by then: none of these vanishes."""
     late = pl.col("time_since_failure_may_s").fill_null(np.inf) > 0.0
     certain = pl.col("time_to_failure_s").is_not_null()
     return frame.filter(certain | (pl.col("time_to_failure_may_s").is_not_null() & late))
 
 
-def _missed(failed: pl.DataFrame, time_s: float, since: str) -> int:
+def _count_missed(failed: pl.DataFrame, time_s: float, since: str) -> int:
+    """Failures not detected so long after they began."""
     return int((failed[since].fill_null(np.inf) > time_s).sum())
 
 
@@ -168,12 +170,13 @@ def pmd_table(
 
 
 def _pmd_rows(injections: pl.DataFrame, bank: str, cell: Cell, plan: RecordedPlan) -> Iterator[Row]:
-    failed = _failed(injections.filter(bank=bank, cell=cell.name))
+    """Pmd of one cell by one bank, at times since failure."""
+    failed = _failed_positions(injections.filter(bank=bank, cell=cell.name))
     if failed.is_empty():
         return
-    independent = passes(failed, plan.pass_s)
+    independent = independent_passes(failed, plan.pass_s)
     for time_s in _times_since_failure_s(failed).tolist():
-        missed = _missed(failed, time_s, "time_since_failure_may_s")
+        missed = _count_missed(failed, time_s, "time_since_failure_may_s")
         yield {
             "bank": bank,
             **cell.labels,
@@ -182,7 +185,7 @@ def _pmd_rows(injections: pl.DataFrame, bank: str, cell: Cell, plan: RecordedPla
             "passes": independent.number,
             "missed": missed,
             **bounded_share("pmd", missed, failed.height, independent.worth),
-            "missed_certain": _missed(failed.drop_nulls("time_to_failure_s"), time_s, "time_since_failure_s"),
+            "missed_certain": _count_missed(failed.drop_nulls("time_to_failure_s"), time_s, "time_since_failure_s"),
         }
 
 
@@ -238,9 +241,10 @@ def banks_table(
 
 
 def _bank_row(frame: pl.DataFrame, fault_free: FaultFree, cells: pl.DataFrame, plan: RecordedPlan) -> Row:
-    failed = _failed(frame)
-    independent = passes(failed, plan.pass_s)
-    missed = _missed(failed, 0.0, "time_since_failure_may_s")
+    """Detection of all cells against false alarms, of one bank."""
+    failed = _failed_positions(frame)
+    independent = independent_passes(failed, plan.pass_s)
+    missed = _count_missed(failed, 0.0, "time_since_failure_may_s")
     slowest = cells.filter(pl.col("injections") > 0).sort(
         pl.col("time_to_detect_median_s").fill_null(np.inf), descending=True, maintain_order=True
     )

@@ -20,7 +20,7 @@ from pipeline.make.receivers.messages import NoEpochError, UnknownError, read_me
 from pipeline.make.receivers.rtklib import is_solution, parts_of_solution, read_solution
 from pipeline.make.receivers.unpack import BAG_FOLDER, unpacked_logs
 from pipeline.read.ingest.conform import conform, refuse
-from pipeline.read.ingest.correct import corrected, corrections_of
+from pipeline.read.ingest.correct import correct_run, corrections_of
 from pipeline.read.ingest.mapping import mappings_of
 from pipeline.read.ingest.parts import LogPart, parts_of_messages, parts_of_topics
 from pipeline.read.ingest.plan import absent_topics
@@ -100,7 +100,7 @@ def as_run(
     held = logs.corrections_as(purpose or Purpose())
     notes = IngestNotes(damage=logs.damage, corrections=held)
     run = RunLog(run_id, streams["gnss"], notes=notes).with_streams(**streams)
-    return Converted(corrected(run, correct, later=True), logs.dropped, logs.parts)
+    return Converted(correct_run(run, correct, later=True), logs.dropped, logs.parts)
 
 
 def extend_run(
@@ -132,8 +132,8 @@ def extend_run(
     streams = assign_purpose(logs.streams, purpose, sigmas)
     notes = IngestNotes(corrections=logs.corrections_as(purpose))
     bare = RunLog(run.run_id, run.gnss.clear(), notes=notes).with_streams(**streams)
-    new = corrected(bare, [made for made in correct if made.stream in streams], later=True)
-    old = corrected(run, correct, later=True)
+    new = correct_run(bare, [made for made in correct if made.stream in streams], later=True)
+    old = correct_run(run, correct, later=True)
     for name in streams.keys() & set(BY_SOLUTION):
         if old.stream(name) is not None:
             _refuse_unlike(corrections_of(old, name), corrections_of(new, name), name, place)

@@ -13,12 +13,12 @@ import polars as pl
 
 from pipeline.make.receivers.csv_times import parse_instants, time_columns
 from pipeline.read.ingest.conform import refuse
-from pipeline.read.ingest.csv_text import CUT_ROW, read_log_table, with_points
+from pipeline.read.ingest.csv_text import CUT_ROW, read_log_table, with_decimal_points
 from pipeline.read.ingest.mapping import mappings_of
 from pipeline.read.ingest.mcap_records import Channel
 from pipeline.read.ingest.parts import LogPart, mappings_for, parts_of_table
 from pipeline.read.ingest.plan import Sample, Source, mapped_source
-from pipeline.read.ingest.wraps import said_of_wraps, with_whole_counts
+from pipeline.read.ingest.wraps import with_whole_counts, wrap_remarks
 from pipeline.stages.epochs.clock import GAP_PERIODS
 from schemas.config import IngestConfig, StreamMapping
 from schemas.errors import InputError
@@ -56,7 +56,7 @@ class CsvLog(NamedTuple):
 def read_csv(path: Path, config: IngestConfig) -> CsvLog:
     """A CSV file; each mapping whose `topic` is the file's name, its stem or `*` makes a stream, or a part of it."""
     log = read_log_table(path, infer=True)
-    table = with_points(log)
+    table = with_decimal_points(log)
     mappings = mappings_for(path, config)
     if not mappings:
         raise InputError(
@@ -136,7 +136,7 @@ def _map_columns(
         t_ns = times.to_physical().fill_null(0).to_numpy()
         whole, found = with_whole_counts(fields[counter], t_ns, mapping.wrap, sensors, config.wraps)
         fields = fields.with_columns(whole) if found else fields
-        left.update(said_of_wraps(found, counter))
+        left.update(wrap_remarks(found, counter))
     columns = {name: _without_nan(expression, fields) for name, expression in source.columns.items()}
     if stream in ("gnss", "satellites"):
         columns = {"solution": pl.lit(mapping.solution, dtype=pl.String)} | columns

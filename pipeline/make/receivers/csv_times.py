@@ -10,12 +10,12 @@ import polars as pl
 from pipeline.read.ingest.stamps import (
     LEAST_DAY,
     MOST_DAY,
+    counts_within,
     day_is_unclear,
     gps_ns_of_weeks,
     orders_of_day,
     time_source,
     utc_of,
-    within,
 )
 from pipeline.read.ingest.timescale import WEEK_NS
 from schemas.arrays import NS_PER_S, runs_of
@@ -137,7 +137,7 @@ def _from_texts(texts: pl.Series, mapping: StreamMapping, place: str) -> pl.Seri
             pl.coalesce("y", year), pl.coalesce("ym", month), pl.coalesce("yd", day), hour, "m",
             pl.col("s").fill_null(0), time_unit="us",
         )  # fmt: skip
-        whole = within(number.select(civil.dt.timestamp("us")).to_series(), 1000) * 1000
+        whole = counts_within(number.select(civil.dt.timestamp("us")).to_series(), 1000) * 1000
     except pl.exceptions.PolarsError as error:
         raise InputError(f"holds no times: {str(error).splitlines()[0]}", place=place, expected=_FORMS) from None
     _refuse_values(whole.is_null() & texts.is_not_null(), texts, place, "holds no times", _FORMS)
@@ -174,7 +174,7 @@ def _from_zone(local_ns: pl.Series, local: pl.Series, zone: str, place: str) -> 
         )
         expected = "times that there are; clocks leave an hour out in spring"
         _refuse_values(never, civil, place, f"holds a time that clocks never show in {zone}", expected, remedy)
-    parse_instants, unclear = _resolve_repeated_hours(local_ns, first, second, local & (first != second))
+    instants, unclear = _resolve_repeated_hours(local_ns, first, second, local & (first != second))
     if unclear.any():
         row = int(unclear.arg_max() or 0)
         zones = " or ".join(_fixed_zone(local_ns[row] - utc_ns[row]) for utc_ns in (first, second))
@@ -182,7 +182,7 @@ def _from_zone(local_ns: pl.Series, local: pl.Series, zone: str, place: str) -> 
         remedy = f"Let the logger write UTC or the offset (+02:00), or, {fixed}"
         expected = "each time once, or rows that show the change; clocks show an hour twice in autumn"
         _refuse_values(unclear, civil, place, f"holds a time that is not clear in {zone}", expected, remedy)
-    return pl.select(pl.when(local).then(parse_instants).otherwise(local_ns)).to_series()
+    return pl.select(pl.when(local).then(instants).otherwise(local_ns)).to_series()
 
 
 def _refuse_other_letters(utc_ns: pl.Series, letters: pl.Series, texts: pl.Series, zone: str, place: str) -> None:
@@ -210,8 +210,8 @@ def _resolve_repeated_hours(
     Rows that follow each other within a minute show the one step back by the hour; without it, they are of the first
     hour where they go on from before it, of the second where they go on behind it.
     """
-    parse_instants = first.to_numpy().copy()
-    unclear = np.zeros(parse_instants.size, dtype=np.bool_)
+    instants = first.to_numpy().copy()
+    unclear = np.zeros(instants.size, dtype=np.bool_)
     clock_ns = local_ns.fill_null(0).to_numpy()
     steps_ns = np.diff(clock_ns)
     back_ns = second.fill_null(0).to_numpy() - first.fill_null(0).to_numpy()
@@ -227,8 +227,8 @@ def _resolve_repeated_hours(
             unclear[rows] = True
         elif turn.size or behind:
             later = slice(begin + int(turn[0]) + 1 if turn.size else begin, end + 1)
-            parse_instants[later] += back_ns[begin]
-    return pl.Series(parse_instants).set(first.is_null(), None), pl.Series(unclear)
+            instants[later] += back_ns[begin]
+    return pl.Series(instants).set(first.is_null(), None), pl.Series(unclear)
 
 
 def _offset_ns(zone: pl.Series) -> pl.Series:

@@ -16,7 +16,7 @@ import polars as pl
 from pipeline.make.receivers.earth_fixed import east_north_up, geodetic
 from pipeline.read.ingest.csv_text import CUT_ROW
 from pipeline.read.ingest.parts import LogPart
-from pipeline.read.ingest.stamps import gps_ns_of_weeks, utc_of, within
+from pipeline.read.ingest.stamps import counts_within, gps_ns_of_weeks, utc_of
 from pipeline.read.numbers import numbers_of
 from schemas.arrays import NS_PER_S, Floats
 from schemas.enums import Fix
@@ -163,7 +163,7 @@ def _parse_times(words: Any, layout: _RtklibHeader, path: Path) -> pl.Series:
         text = pl.Series(np.char.add(np.char.add(words[:, 0], "T"), words[:, 1]))
         date_us = text.str.to_datetime("%Y/%m/%dT%H:%M:%S%.f", time_unit="us", strict=False).to_physical()
         exact = text.str.to_datetime("%Y/%m/%dT%H:%M:%S%.f", time_unit="ns", strict=False).to_physical()
-        t_ns = exact.set(within(date_us, 1000).is_null(), None)
+        t_ns = exact.set(counts_within(date_us, 1000).is_null(), None)
     else:
         week = pl.Series(words[:, 0]).cast(pl.Int64, strict=False)
         t_ns = gps_ns_of_weeks(week, pl.Series(words[:, 1]).cast(pl.Float64, strict=False))

@@ -13,7 +13,7 @@ from scipy.sparse.csgraph import dijkstra
 from pipeline.make.survey.network import SurveyNetwork
 from pipeline.make.survey.pieces import Survey, content_of_survey, measures_at
 from pipeline.make.survey.tables import placed_table
-from pipeline.read.ingest.guesses import BALISE_KINDS, BALISE_LIST, first, word_of
+from pipeline.read.ingest.guesses import BALISE_KINDS, BALISE_LIST, first_fitting, word_of
 from pipeline.read.site.tables import RawTable, typed_table
 from pipeline.stages.paths.candidates import candidates_of, segments_of
 from pipeline.stages.track.geodesy import points_of
@@ -108,7 +108,7 @@ def _with_names_and_kinds(table: pl.DataFrame, survey: Survey) -> pl.DataFrame:
     words = {name: word_of(name) for name in table.columns}
     columns = f"columns {', '.join(table.columns)}"
     for key, patterns in BALISE_LIST.items():
-        found = (first(words, pattern) for pattern in patterns)
+        found = (first_fitting(words, pattern) for pattern in patterns)
         fitting = next((name for name in found if name and table[name].null_count() == 0), None)
         if key not in table.columns and fitting and (key != "balise_id" or table[fitting].is_unique().all()):
             table = table.rename({fitting: key})

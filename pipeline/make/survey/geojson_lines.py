@@ -11,11 +11,11 @@ from pipeline.make.survey.pieces import Survey, piece_of
 from pipeline.read.site.geojson import (
     AXES_IN_DOUBT,
     AXES_REMEDY,
+    coordinates_of,
     has_relations,
     latitude_first,
-    parts_of,
+    properties_and_geometry,
     read_network,
-    triple,
 )
 from pipeline.read.site.read import to_wgs84
 from schemas.config import SiteConfig
@@ -137,7 +137,7 @@ def _railway_kind(tags: Mapping[str, Any]) -> str:
 
 def _tags_and_geometry(item: Any) -> Feature:
     """Tags and geometry; some programs put tags into a property of their own."""
-    properties, geometry = parts_of(item)
+    properties, geometry = properties_and_geometry(item)
     nested = properties.get("tags")
     tags = dict(properties) | (dict(nested) if isinstance(nested, Mapping) else {})
     if item.get("id") not in (None, ""):
@@ -166,7 +166,7 @@ def _line_piece(place: str, name: str, line: Any) -> Any:
 def _coordinates(place: str, point: Any) -> tuple[float, float, float | None]:
     """Longitude, latitude and height of a point."""
     try:
-        return triple(point)
+        return coordinates_of(point)
     except ValueError:
         raise SiteError(
             "a coordinate cannot be read", place=place, found=repr(point)[:60], expected="[longitude, latitude]"

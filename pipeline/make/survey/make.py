@@ -16,8 +16,8 @@ from pipeline.make.survey.pieces import Survey
 from pipeline.make.survey.sources import read_surveys
 from pipeline.make.survey.trace import clean_traces
 from pipeline.read.site.alike import ambiguities
-from pipeline.read.site.checks import remarks
-from pipeline.read.site.describe import without_balises
+from pipeline.read.site.checks import check_site
+from pipeline.read.site.describe import no_balises_finding
 from pipeline.stages.track.survey import track_of
 from pipeline.storage.described import table_bytes
 from pipeline.storage.writing import replace_files
@@ -100,7 +100,7 @@ def make_site(wish: SiteRequest, vehicle: Vehicle, config: Configuration) -> Sit
         raise SiteError("nothing is left of the survey", place=", ".join(map(str, wish.surveys)))
     balises = _requested_balises(wish, network, survey, config)
     track = network.track
-    remarked = remarks(track_of(track), network.links, balises, None, survey.declared_m, config.site)
+    remarked = check_site(track_of(track), network.links, balises, None, survey.declared_m, config.site)
     if remarked.breaches:
         raise SiteError(remarked.breaches[0], place=", ".join(map(str, wish.surveys)))
     # Relations as given: what no train can run over is said, and left out, each time that the site is read.
@@ -110,7 +110,7 @@ def make_site(wish: SiteRequest, vehicle: Vehicle, config: Configuration) -> Sit
         *survey.findings,
         *find_doubts(network, config.survey, config.site),
         *remarked.findings,
-        *without_balises(balises),
+        *no_balises_finding(balises),
     )
     return replace(site, findings=findings)
 

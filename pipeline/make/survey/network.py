@@ -14,7 +14,7 @@ from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
 from pipeline.make.survey.pieces import COLUMNS, LinePiece, Relation, Survey
-from pipeline.read.site.checks import outward, relations_to_nowhere
+from pipeline.read.site.checks import directions_inward, relations_to_nowhere
 from pipeline.stages.track.geodesy import points_of
 from pipeline.stages.track.survey import geometric_measures_m, track_of
 from schemas.arrays import Floats, Ints, spans_of
@@ -217,7 +217,7 @@ def _link_table(
     """
     track = track_of(table)
     relations = survey.relations
-    directions = outward(track)
+    directions = directions_inward(track)
     names = track.ids
     named = {end for a, a_end, b, b_end, _ in relations for end in ((a, a_end), (b, b_end))}
     rows = list(relations)

@@ -8,9 +8,9 @@ from dataclasses import replace
 import polars as pl
 
 from pipeline.read.ingest.conform import DEFAULTS, conform
-from pipeline.read.ingest.plan import Source, is_world_frame, missing_field, world_frame
+from pipeline.read.ingest.plan import Source, is_world_frame, missing_field_error, world_frame_error
 from pipeline.read.ingest.reader import ORDINAL
-from pipeline.read.ingest.wraps import said_of_wraps, whole_stream, with_whole_counts
+from pipeline.read.ingest.wraps import whole_stream, with_whole_counts, wrap_remarks
 from schemas.config import IngestConfig
 from schemas.errors import InputError
 from schemas.frozen import frozen
@@ -39,22 +39,23 @@ def stream_frames(
     for stream in STREAMS:
         parts = [part for part in decoded if part.source.recipe.stream == stream]
         if parts:
-            frames[stream] = _stream(stream, parts, breaches, config, remarks)
+            frames[stream] = _stream_frame(stream, parts, breaches, config, remarks)
     return frames
 
 
-def _stream(
+def _stream_frame(
     stream: Stream, parts: Sequence[DecodedRows], breaches: list[InputError], config: IngestConfig, remarks: list[str]
 ) -> pl.DataFrame:
+    """One stream of all its sources, with what they lack among the breaches."""
     place = ", ".join(dict.fromkeys(part.source.channel.place for part in parts))
     breaches += [
-        missing_field(part.source.channel, [], column, [path])
+        missing_field_error(part.source.channel, [], column, [path])
         for part in parts
         for column, path in part.source.doubtful.items()
         if part.frame[path].null_count() == part.frame.height
     ]
     supplements = [part for part in parts if part.source.recipe.supplement]
-    rows = [_rows(part, supplements, config, remarks) for part in parts if not part.source.recipe.supplement]
+    rows = [_source_rows(part, supplements, config, remarks) for part in parts if not part.source.recipe.supplement]
     joined = pl.concat(rows, how="diagonal_relaxed")
     frame = joined if len(rows) == 1 else joined.sort(ORDINAL, maintain_order=True)
     conformed = conform(frame, stream, place, breaches)
@@ -66,11 +67,11 @@ def _stream(
     return whole
 
 
-def _supplemented(frame: pl.DataFrame, part: DecodedRows, supplements: Sequence[DecodedRows]) -> pl.DataFrame:
+def _with_supplements(frame: pl.DataFrame, part: DecodedRows, supplements: Sequence[DecodedRows]) -> pl.DataFrame:
     """With the columns that other messages of the same receiver hold for the same epochs."""
     key = list(part.source.recipe.key)
     for supplement in supplements:
-        if supplement.source.recipe.key != part.source.recipe.key or not _same_receiver(part, supplement):
+        if supplement.source.recipe.key != part.source.recipe.key or not _are_of_one_receiver(part, supplement):
             continue
         columns = [expression.alias(name) for name, expression in supplement.source.columns.items()]
         extra = supplement.frame.select(*key, *columns).unique(subset=key, keep="first", maintain_order=True)
@@ -79,14 +80,15 @@ def _supplemented(frame: pl.DataFrame, part: DecodedRows, supplements: Sequence[
     return frame
 
 
-def _same_receiver(part: DecodedRows, supplement: DecodedRows) -> bool:
-    """Drivers publish the messages of one receiver side by side."""
+def _are_of_one_receiver(part: DecodedRows, supplement: DecodedRows) -> bool:
+    """Whether two topics are of one receiver: drivers publish its messages side by side."""
     return part.source.channel.topic.rpartition("/")[0] == supplement.source.channel.topic.rpartition("/")[0]
 
 
-def _rows(
+def _source_rows(
     part: DecodedRows, supplements: Sequence[DecodedRows], config: IngestConfig, remarks: list[str]
 ) -> pl.DataFrame:
+    """Rows of one source, with its times and supplements."""
     source = part.source
     _refuse_world_frame(part)
     try:
@@ -94,14 +96,14 @@ def _rows(
     except (ValueError, pl.exceptions.PolarsError) as error:
         reason = str(error).splitlines()[0]
         raise InputError(f"has a time that cannot be read: {reason}", place=source.channel.place) from None
-    part = replace(part, frame=_counted_on(part, times, config, remarks))
-    columns = _explicit(part.frame.select(ORDINAL, **source.columns), source)
-    frame = _supplemented(_named(columns.with_columns(times), part), part, supplements)
+    part = replace(part, frame=_unwrap_counter(part, times, config, remarks))
+    columns = _without_unset(part.frame.select(ORDINAL, **source.columns), source)
+    frame = _with_supplements(_with_solution(columns.with_columns(times), part), part, supplements)
     if "t" not in source.times:
         return frame
     if frame["t"].null_count() and _may_be_left_out(part, frame["t"].is_null(), config.wrong_dates_share, remarks):
         frame = frame.drop_nulls("t")
-    return _stamped(frame, source, remarks)
+    return _without_zero_stamps(frame, source, remarks)
 
 
 def _refuse_world_frame(part: DecodedRows) -> None:
@@ -109,10 +111,10 @@ def _refuse_world_frame(part: DecodedRows) -> None:
     source = part.source
     for frame in filter(is_world_frame, part.speed_frames):
         (path,) = source.columns["speed_mps"].meta.root_names()
-        raise world_frame(source.channel, path, frame)
+        raise world_frame_error(source.channel, path, frame)
 
 
-def _counted_on(
+def _unwrap_counter(
     part: DecodedRows, times: Sequence[pl.Series], config: IngestConfig, remarks: list[str]
 ) -> pl.DataFrame:
     """The fields with a mapped counter counted on where it begins anew."""
@@ -126,7 +128,7 @@ def _counted_on(
     sensors = part.frame[mapping.fields["sensor"]] if mapping.fields.get("sensor") in part.frame.columns else None
     whole, found = with_whole_counts(part.frame[path], t_ns, mapping.wrap, sensors, config.wraps)
     topic = part.source.channel.topic
-    remarks += [f"{topic}: {times} x {said}" for said, times in said_of_wraps(found, path).items()]
+    remarks += [f"{topic}: {times} x {said}" for said, times in wrap_remarks(found, path).items()]
     return part.frame.with_columns(whole) if found else part.frame
 
 
@@ -159,7 +161,7 @@ def _may_be_left_out(part: DecodedRows, unknown: pl.Series, few: float, remarks:
 _NEVER_ZERO = ("hpl_m", "vpl_m", "sbas_prn", "sigma_m", "sigma_speed_mps")
 
 
-def _explicit(frame: pl.DataFrame, source: Source) -> pl.DataFrame:
+def _without_unset(frame: pl.DataFrame, source: Source) -> pl.DataFrame:
     """What a protobuf field without presence holds: a column that is 0 throughout was not recorded."""
     if not source.implicit:
         return frame
@@ -179,11 +181,11 @@ def _explicit(frame: pl.DataFrame, source: Source) -> pl.DataFrame:
 
 
 def _gives_distance(frame: pl.DataFrame, silent: Sequence[str]) -> bool:
-    """Whether the odometer gives a distance."""
+    """Whether the odometer gives a distance, apart from the `silent` columns."""
     return "distance_m" in set(frame.columns) - set(silent) and frame["distance_m"].null_count() < frame.height
 
 
-def _stamped(frame: pl.DataFrame, source: Source, remarks: list[str]) -> pl.DataFrame:
+def _without_zero_stamps(frame: pl.DataFrame, source: Source, remarks: list[str]) -> pl.DataFrame:
     """Without the messages whose stamp is 0, as of a driver that did not know the time yet."""
     if source.recipe.own:
         return frame
@@ -206,7 +208,7 @@ def _stamped(frame: pl.DataFrame, source: Source, remarks: list[str]) -> pl.Data
     return frame.filter(~unset.fill_null(False))
 
 
-def _named(frame: pl.DataFrame, part: DecodedRows) -> pl.DataFrame:
+def _with_solution(frame: pl.DataFrame, part: DecodedRows) -> pl.DataFrame:
     """With the solution: what the messages say, else the source's."""
     if part.solution is None:
         return frame

@@ -11,7 +11,7 @@ import polars as pl
 from pydantic import TypeAdapter, ValidationError
 
 from pipeline.read.ingest.conform import conform, refuse
-from pipeline.read.ingest.wraps import counted_on
+from pipeline.read.ingest.wraps import unwrap
 from pipeline.stages.track.geodesy import moved_deg
 from schemas.arrays import NS_PER_S, floats
 from schemas.config import IngestConfig, StreamCorrection, settings_from
@@ -28,7 +28,7 @@ _LISTING = TypeAdapter(tuple[tuple[str, int, str], ...])
 _PLACE = ("latitude_deg", "longitude_deg")
 
 
-def corrected(run: RunLog, corrections: Sequence[StreamCorrection], later: bool = False) -> RunLog:
+def correct_run(run: RunLog, corrections: Sequence[StreamCorrection], later: bool = False) -> RunLog:
     """The run as the configuration corrects it, each correction once; `notes` lists them.
 
     A stream that was written with corrections holds them already: what the configuration begins with is left out.
@@ -37,11 +37,11 @@ def corrected(run: RunLog, corrections: Sequence[StreamCorrection], later: bool 
     Raises `ConfigError` for a stream or column that the run does not have, `InputError` for values that the contract
     does not allow afterwards, and for a stream that holds other corrections than these.
     """
-    missing = [made for stream in STREAMS for made in _missing(run, stream, corrections)]
-    return corrected_further(run, [made for made in missing if not later or run.stream(made.stream) is not None])
+    missing = [made for stream in STREAMS for made in _missing_corrections(run, stream, corrections)]
+    return correct_further(run, [made for made in missing if not later or run.stream(made.stream) is not None])
 
 
-def corrected_further(run: RunLog, corrections: Sequence[StreamCorrection]) -> RunLog:
+def correct_further(run: RunLog, corrections: Sequence[StreamCorrection]) -> RunLog:
     """The run with these corrections in order, on top of those that it holds. Raises as `corrected`."""
     for correction in corrections:
         frame = run.stream(correction.stream)
@@ -51,12 +51,14 @@ def corrected_further(run: RunLog, corrections: Sequence[StreamCorrection]) -> R
                 place=f"{run.run_id}: [[ingest.correct]] stream = {correction.stream!r}",
                 remedy="Remove this correction, or replay this run with another configuration.",
             )
-        run = run.with_streams(**{correction.stream: _corrected(frame, correction, run.run_id)})
+        run = run.with_streams(**{correction.stream: _correct_stream(frame, correction, run.run_id)})
         run = replace(run, notes=replace(run.notes, corrections=(*run.notes.corrections, correction)))
     return run
 
 
-def _missing(run: RunLog, stream: Stream, corrections: Sequence[StreamCorrection]) -> Sequence[StreamCorrection]:
+def _missing_corrections(
+    run: RunLog, stream: Stream, corrections: Sequence[StreamCorrection]
+) -> Sequence[StreamCorrection]:
     """Those of a stream that it does not hold yet; where it holds others, nobody knows what would be made twice."""
     held = corrections_of(run, stream)
     wanted = [correction for correction in corrections if correction.stream == stream]
@@ -123,17 +125,18 @@ def read_corrections(metadata: Mapping[str, str], stream: Stream, place: str) ->
     return held
 
 
-def _corrected(frame: pl.DataFrame, correction: StreamCorrection, run_id: str) -> pl.DataFrame:
-    _refuse_unknown(correction)
+def _correct_stream(frame: pl.DataFrame, correction: StreamCorrection, run_id: str) -> pl.DataFrame:
+    """A stream with one correction made."""
+    _refuse_unknown_columns(correction)
     mended = frame
     if correction.exchange is not None:
         first, second = correction.exchange
         mended = mended.with_columns(pl.col(second).alias(first), pl.col(first).alias(second))
-    mended = _counted_on(mended, correction.wrap) if correction.wrap is not None else mended
+    mended = _unwrap_distances(mended, correction.wrap) if correction.wrap is not None else mended
     mended = mended.with_columns(pl.col(name) * factor for name, factor in correction.factors.items())
-    mended = _later(mended, correction.shift_s) if correction.shift_s else mended
+    mended = _shift_times(mended, correction.shift_s) if correction.shift_s else mended
     if correction.moves:
-        mended = _moved(mended, correction)
+        mended = _move_positions(mended, correction)
     if correction.solution is not None and "solution" in frame.columns:
         meant = pl.col("solution") == correction.solution
         mended = frame.with_columns(pl.when(meant).then(mended[name]).otherwise(pl.col(name)) for name in frame.columns)
@@ -143,16 +146,16 @@ def _corrected(frame: pl.DataFrame, correction: StreamCorrection, run_id: str) -
     return conformed
 
 
-def _counted_on(odometer: pl.DataFrame, size: float) -> pl.DataFrame:
+def _unwrap_distances(odometer: pl.DataFrame, size: float) -> pl.DataFrame:
     """Distances of counters that begin anew after so much, by sensor."""
     distance = floats(odometer, "distance_m").copy()
     for sensor in odometer["sensor"].unique():
         rows = np.flatnonzero((odometer["sensor"] == sensor).to_numpy())
-        distance[rows] = counted_on(distance[rows], size)
+        distance[rows] = unwrap(distance[rows], size)
     return odometer.with_columns(pl.Series("distance_m", distance).fill_nan(None))
 
 
-def _later(frame: pl.DataFrame, shift_s: float) -> pl.DataFrame:
+def _shift_times(frame: pl.DataFrame, shift_s: float) -> pl.DataFrame:
     """Times shifted; null where 64 bits of nanoseconds cannot hold them."""
     shift_ns = round(shift_s * NS_PER_S)
     later = pl.col("t") + pl.duration(nanoseconds=shift_ns, time_unit="ns")
@@ -160,7 +163,7 @@ def _later(frame: pl.DataFrame, shift_s: float) -> pl.DataFrame:
     return frame.with_columns(pl.when((later > pl.col("t")) == (shift_ns > 0)).then(later).alias("t"))
 
 
-def _moved(frame: pl.DataFrame, correction: StreamCorrection) -> pl.DataFrame:
+def _move_positions(frame: pl.DataFrame, correction: StreamCorrection) -> pl.DataFrame:
     """Positions moved by the shift; heights where there are any."""
     latitude, longitude = (floats(frame, name) for name in _PLACE)
     height = floats(frame, "height_m")
@@ -176,18 +179,20 @@ def unknown_columns(correction: StreamCorrection) -> list[str]:
     """The columns that it names and that cannot be corrected: only numbers can be multiplied, only places be moved."""
     names = [*correction.factors, *(correction.exchange or ()), *([*_PLACE, "height_m"] if correction.moves else [])]
     names += [] if correction.wrap is None else ["distance_m"]
-    return sorted(set(names) - set(_numbers(correction.stream)))
+    return sorted(set(names) - set(_number_columns(correction.stream)))
 
 
-def _numbers(stream: Stream) -> list[str]:
+def _number_columns(stream: Stream) -> list[str]:
+    """Columns of a stream that hold floats."""
     return [name for name, column in STREAM_SCHEMAS[stream].columns().items() if column.dtype == pl.Float64]
 
 
-def _refuse_unknown(correction: StreamCorrection) -> None:
+def _refuse_unknown_columns(correction: StreamCorrection) -> None:
+    """Refuse a correction of columns that cannot be corrected."""
     if unknown := unknown_columns(correction):
         raise ConfigError(
             "names columns that cannot be corrected",
             place=f"[[ingest.correct]] stream = {correction.stream!r}",
             found=", ".join(unknown),
-            expected="some of " + ", ".join(_numbers(correction.stream)),
+            expected="some of " + ", ".join(_number_columns(correction.stream)),
         )

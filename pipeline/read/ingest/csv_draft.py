@@ -9,13 +9,13 @@ from pathlib import Path
 
 import polars as pl
 
-from pipeline.read.ingest.csv_text import read_log_table, with_points
+from pipeline.read.ingest.csv_text import read_log_table, with_decimal_points
 from pipeline.read.ingest.guesses import (
     COLUMNS,
     POSITION,
     WORDS,
     columns_in,
-    first,
+    first_fitting,
     known_zones,
     mapping_lines,
     one_line,
@@ -49,20 +49,20 @@ Words = Mapping[str, str]
 def draft_mapping(path: Path) -> str:
     """Configuration text for `balise convert`, to be saved and checked; what nothing shows is a comment."""
     log = read_log_table(path, infer=True)
-    table = with_points(log)
+    table = with_decimal_points(log)
     pairs = zip(log.table.columns, log.units, strict=False)
     units = {name: unit for name, written in pairs if (unit := written.strip("[]()<> ").lower())}
     words = {name: word_of(name) for name in table.columns if name.strip()}
     time = _time_lines(table, words, units)
-    parts = [part for stream in COLUMNS if (part := _stream(stream, table, words, path.name, time, units))]
-    parts += _reads(words, path.name, time)
+    parts = [part for stream in COLUMNS if (part := _stream_lines(stream, table, words, path.name, time, units))]
+    parts += _read_lines(words, path.name, time)
     head = f"# Draft from the header of {path.name}: check each line, above all units and the scale of the times.\n"
     columns = f"# Columns: {', '.join(map(one_line, table.columns))}\n"
-    columns += _unused(table.columns, parts)
+    columns += _unused_columns(table.columns, parts)
     return head + columns + ("\n".join(parts) if parts else _EMPTY.format(topic=json.dumps(path.name)))
 
 
-def _unused(columns: Sequence[str], parts: Sequence[str]) -> str:
+def _unused_columns(columns: Sequence[str], parts: Sequence[str]) -> str:
     """The columns that no line of the draft uses, so that nothing is left out without a word."""
     active = [line for part in parts for line in part.splitlines() if line and not line.startswith("#")]
     texts = [text for line in active for text in re.findall(r'"((?:[^"\\]|\\.)*)"', line)]
@@ -71,17 +71,18 @@ def _unused(columns: Sequence[str], parts: Sequence[str]) -> str:
     return f"# Unused columns: {', '.join(map(one_line, rest))}\n" if rest else ""
 
 
-def _stream(
+def _stream_lines(
     stream: Stream, table: pl.DataFrame, words: Words, file: str, time: tuple[list[str], float | None], units: Words
 ) -> str:
+    """Lines of the mapping of one stream, commented out where they are in doubt; empty where nothing fits."""
     numbers = {name: word for name, word in words.items() if table[name].dtype.is_numeric()}
     # Rows of several odometers must stay apart: one after the other they are no counter.
-    sensor = first(words, WORDS["sensor"]) if stream == "odometer" else None
-    kind = _kinds_of_fix(table, words) if stream == "gnss" else None
+    sensor = first_fitting(words, WORDS["sensor"]) if stream == "odometer" else None
+    kind = _fix_column(table, words) if stream == "gnss" else None
     texts = {column: name for column, name in (("sensor", sensor), ("fix", kind)) if name is not None}
     lines = mapping_lines(stream, file, numbers, *time, units, texts)
     lines += _wrap_lines(table, columns_in(stream, numbers)) if stream == "odometer" and lines and not sensor else []
-    unfit = _unfit(stream, table, {name: word for name, word in words.items() if name not in numbers})
+    unfit = _unfit_lines(stream, table, {name: word for name, word in words.items() if name not in numbers})
     if stream == "odometer" and lines and set(columns_in("gnss", words)) >= POSITION:
         lines = [_WITH_POSITIONS, *(line if line.startswith("#") else f"# {line}" for line in lines)]
     return "\n".join(["", *lines, *unfit]) + "\n" if lines or unfit else ""
@@ -98,18 +99,18 @@ def _wrap_lines(table: pl.DataFrame, names: Words) -> list[str]:
     return [wrap.line if wrap.certain else f"# {wrap.line}  # if the counter begins anew there, and was not reset"]
 
 
-def _kinds_of_fix(table: pl.DataFrame, words: Words) -> str | None:
+def _fix_column(table: pl.DataFrame, words: Words) -> str | None:
     """The column of kinds of fix, where it holds this program's own words; codes of others need `fix_codes`."""
-    name = first(words, WORDS["fix"])
+    name = first_fitting(words, WORDS["fix"])
     if name is None or table[name].dtype != pl.String:
         return None
     values = set(table[name].replace("", None).drop_nulls())
     return name if values and values <= {kind.value for kind in Fix} else None
 
 
-def _reads(words: Words, file: str, time: tuple[list[str], float | None]) -> list[str]:
+def _read_lines(words: Words, file: str, time: tuple[list[str], float | None]) -> list[str]:
     """The mapping of balise reads; of a table that holds more, rows without a balise are no reads."""
-    balise = first(words, WORDS["balise"])
+    balise = first_fitting(words, WORDS["balise"])
     if balise is None:
         return []
     factors = [f"factors = {{ t = {time[1]:.10g} }}"] if time[1] else []
@@ -118,7 +119,7 @@ def _reads(words: Words, file: str, time: tuple[list[str], float | None]) -> lis
     return ["\n".join([*lines, fields, *factors]) + "\n"]
 
 
-def _unfit(stream: Stream, table: pl.DataFrame, words: Words) -> list[str]:
+def _unfit_lines(stream: Stream, table: pl.DataFrame, words: Words) -> list[str]:
     """What is left out though its name fits, since it holds texts."""
     lines = []
     for column, name in columns_in(stream, words).items():
@@ -133,49 +134,52 @@ def _unfit(stream: Stream, table: pl.DataFrame, words: Words) -> list[str]:
 def _time_lines(table: pl.DataFrame, words: Words, units: Words) -> tuple[list[str], float | None]:
     """The lines on time, and the seconds per unit of the times where they are not seconds."""
     words = words_of_times(words)
-    week = first(words, WORDS["week"])
-    seconds = first(words, WORDS["seconds"])
+    week = first_fitting(words, WORDS["week"])
+    seconds = first_fitting(words, WORDS["seconds"])
     if week and seconds:
         milli = (unit_in(seconds) or units.get(seconds)) == "ms" or words[seconds] == "itow"
-        return [_field(week, seconds), 'time_epoch = "gps"'], 1e-3 if milli else None
-    date = first(words, WORDS["date"])
-    clock = first(words, WORDS["clock"])
-    names = [date, clock] if date and clock else [first(words, WORDS["time"]) or date]
+        return [_time_field_line(week, seconds), 'time_epoch = "gps"'], 1e-3 if milli else None
+    date = first_fitting(words, WORDS["date"])
+    clock = first_fitting(words, WORDS["clock"])
+    names = [date, clock] if date and clock else [first_fitting(words, WORDS["time"]) or date]
     if names[0] is None:
         return ['# time = "field:COLUMN"  # no name shows which column is the time'], None
     written = [name for name in names if name]
     zones = [zone for name in written for part in (name, f"({units.get(name, '')})") if (zone := zone_in(part)[0])]
-    if zones and (lines := _in_zone(zones[0], written, table)):
+    if zones and (lines := _zone_lines(zones[0], written, table)):
         return lines, None
     if any("gpsepoch" in words[name] for name in written):
-        return [_field(*written), 'time_epoch = "gps"', 'time_scale = "gps"'], _since_gps(words[written[0]])
-    epoch, scale = _epoch(table[written[0]])
+        return [_time_field_line(*written), 'time_epoch = "gps"', 'time_scale = "gps"'], _gps_unit_s(words[written[0]])
+    epoch, scale = _epoch_lines(table[written[0]])
     gps = ['# time_scale = "gps"  # if these times are 18 s ahead of UTC'] if "gps" in words[written[-1]] else []
-    return [_field(*written), *epoch, *_order(table[written[0]]), *gps], scale
+    return [_time_field_line(*written), *epoch, *_day_order_lines(table[written[0]]), *gps], scale
 
 
-def _in_zone(zone: str, names: Sequence[str], table: pl.DataFrame) -> list[str]:
+def _zone_lines(zone: str, names: Sequence[str], table: pl.DataFrame) -> list[str]:
     """The lines on times of a zone: with it where it is known for certain, else commented out."""
     known = zone if zone in known_zones() else None
     if offset := re.fullmatch(r"UTC([+-])0?([0-9]{1,2})(?::?00)?", zone):
         # The sign of these names is turned round: Etc/GMT-2 is ahead of UTC.
         known = f"Etc/GMT{'-' if offset[1] == '+' else '+'}{int(offset[2])}"
     if known in known_zones() and all(table[name].dtype == pl.String for name in names):
-        return [_field(*names), f"time_zone = {json.dumps(known)}  # as the name says: {one_line(zone)}"]
+        return [_time_field_line(*names), f"time_zone = {json.dumps(known)}  # as the name says: {one_line(zone)}"]
     reason = f"# in {one_line(zone)!r}, which is not UTC as far as is known here"
-    return [f"# {_field(*names)}  {reason}: add time_zone, as Europe/Berlin, or take these words away for UTC"]
+    return [
+        f"# {_time_field_line(*names)}  {reason}: add time_zone, as Europe/Berlin, or take these words away for UTC"
+    ]
 
 
-def _since_gps(word: str) -> float | None:
+def _gps_unit_s(word: str) -> float | None:
     """Seconds per unit of what counts from 1980-01-06, as the name says."""
     return next((unit for name, unit in (("milli", 1e-3), ("ms", 1e-3), ("nano", 1e-9)) if word.startswith(name)), 1.0)
 
 
-def _field(*names: str) -> str:
+def _time_field_line(*names: str) -> str:
+    """The line that names the columns of the time."""
     return f"time = {json.dumps('field:' + ' + '.join(names), ensure_ascii=False)}"
 
 
-def _order(column: pl.Series) -> list[str]:
+def _day_order_lines(column: pl.Series) -> list[str]:
     """The choice between day and month, where all dates fit both."""
     if column.dtype != pl.String:
         return []
@@ -186,7 +190,7 @@ def _order(column: pl.Series) -> list[str]:
     return ['# date_order = "day_first"  # or "month_first": all dates of the file fit both, so you must say it']
 
 
-def _epoch(column: pl.Series) -> tuple[list[str], float | None]:
+def _epoch_lines(column: pl.Series) -> tuple[list[str], float | None]:
     """What numbers may count, by their size: a line, and the seconds per unit."""
     if not column.dtype.is_numeric() or column.drop_nulls().is_empty():
         return [], None

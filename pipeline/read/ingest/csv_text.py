@@ -50,7 +50,7 @@ def read_table(data: bytes, infer: bool) -> pl.DataFrame:
     The separator is the one of comma, semicolon and tab that divides the header most. Names and texts lose the
     blanks around them. Raises ValueError or a polars error where there is no table.
     """
-    return _table(_lines(data), infer)
+    return _parse_lines(_lines_without_comments(data), infer)
 
 
 def read_log_table(log: Path, infer: bool) -> LogTable:
@@ -64,30 +64,32 @@ def read_log_table(log: Path, infer: bool) -> LogTable:
     except (ValueError, csv.Error, pl.exceptions.PolarsError) as error:
         if isinstance(error, pl.exceptions.ComputeError):
             with suppress(csv.Error):
-                _refuse_long_rows(_lines(data), log)
+                _refuse_long_rows(_lines_without_comments(data), log)
         raise InputError(f"is not a CSV file: {str(error).splitlines()[0]}", place=str(log)) from None
 
 
 def _whole_rows(data: bytes, infer: bool) -> LogTable:
-    written = _lines(data)
-    lines = _from_header(written)
-    separator = _separator(lines)
-    fields = _header(lines).count(separator)
+    """The table without a last row that breaks off, and what was left out."""
+    written = _lines_without_comments(data)
+    lines = _lines_from_header(written)
+    separator = _find_separator(lines)
+    fields = _header_line(lines).count(separator)
     ended = data.rstrip(b" \0").endswith((b"\n", b"\r"))
     whole = lines
     cut = len(lines) > 1 and not ended and lines[-1].count(separator) < fields
     lines, units = _without_units(lines[:-1] if cut else lines, separator)
     short = sum(0 < line.count(separator) < fields for line in lines)
-    return LogTable(_table(lines, infer), int(cut), short, units, separator, len(written) - len(whole))
+    return LogTable(_parse_lines(lines, infer), int(cut), short, units, separator, len(written) - len(whole))
 
 
 def _refuse_wide(lines: list[str]) -> None:
+    """Refuse a table of more columns than are read."""
     widest = max((line.count(separator) for line in lines[:_HEAD_LINES] for separator in _SEPARATORS), default=0)
     if widest >= _MOST_COLUMNS:
         raise ValueError(f"it has {widest + 1} columns; at most {_MOST_COLUMNS} are read")
 
 
-def _from_header(lines: list[str]) -> list[str]:
+def _lines_from_header(lines: list[str]) -> list[str]:
     """Without what a logger writes above the header: lines with fewer values than the rows have.
 
     The header is the first line that has as many values as the row behind it, none of them a number.
@@ -100,18 +102,19 @@ def _from_header(lines: list[str]) -> list[str]:
         if most < 1 or len(tops) < 2 or tops[0] == head[0]:
             continue
         header, *rows = csv.reader([lines[number] for number in tops[:3]], delimiter=separator)
-        if all(cell.strip() for cell in header[:-1]) and not any(map(_has_number, header)) and _are_rows(rows):
+        if all(cell.strip() for cell in header[:-1]) and not any(map(_has_number, header)) and _look_like_rows(rows):
             return lines[tops[0] :]
     return lines
 
 
-def _are_rows(rows: list[list[str]]) -> bool:
+def _look_like_rows(rows: list[list[str]]) -> bool:
     """Numbers in the first row, or behind a row of units in the second."""
     return any(sum(map(_has_number, row)) * 2 > len(row) for row in rows[:2])
 
 
 def _refuse_long_rows(lines: list[str], log: Path) -> None:
-    rows = enumerate(csv.reader(lines, delimiter=_separator(lines)), 1)
+    """Refuse rows with more values than the header."""
+    rows = enumerate(csv.reader(lines, delimiter=_find_separator(lines)), 1)
     header = next((row for _, row in rows if row), [])
     for number, row in rows:
         if len(row) > len(header):
@@ -141,10 +144,11 @@ def _without_units(lines: list[str], separator: str) -> tuple[list[str], tuple[s
 
 
 def _has_number(cell: str) -> bool:
+    """Whether a cell begins with a number."""
     return re.match(r"\s*[+-]?[.,]?[0-9]", cell) is not None
 
 
-def _lines(data: bytes) -> list[str]:
+def _lines_without_comments(data: bytes) -> list[str]:
     """The lines that are no comments; the header may stand in the last comment before the first row."""
     written = text_of(data).splitlines()
     lines = [line for line in written if not re.match(_NO_ROW, line)]
@@ -153,10 +157,10 @@ def _lines(data: bytes) -> list[str]:
         return lines
     before = [line for line in written[: written.index(first)] if line.startswith("#")]
     header = before[-1].lstrip("# ") if before else ""
-    return [header, *lines] if _heads(header, first) else lines
+    return [header, *lines] if _is_heading(header, first) else lines
 
 
-def _heads(comment: str, row: str) -> bool:
+def _is_heading(comment: str, row: str) -> bool:
     """Whether a comment names the columns of a row that has no names itself."""
     separator = max(_SEPARATORS, key=comment.count)
     (names,), (cells,) = (csv.reader([line], delimiter=separator) for line in (comment or " ", row))
@@ -170,17 +174,20 @@ def _heads(comment: str, row: str) -> bool:
     )
 
 
-def _header(lines: list[str]) -> str:
+def _header_line(lines: list[str]) -> str:
+    """The first line that is not empty."""
     return next((line for line in lines if line.strip()), "")
 
 
-def _separator(lines: list[str]) -> str:
-    return max(_SEPARATORS, key=_header(lines).count)
+def _find_separator(lines: list[str]) -> str:
+    """The sign that divides the header most."""
+    return max(_SEPARATORS, key=_header_line(lines).count)
 
 
-def _table(lines: list[str], infer: bool) -> pl.DataFrame:
+def _parse_lines(lines: list[str], infer: bool) -> pl.DataFrame:
+    """The lines as a table, without rows that are empty."""
     _refuse_wide(lines)
-    separator = _separator(lines)
+    separator = _find_separator(lines)
     body = "\n".join(lines).lstrip("\n")
     length = None if infer else 0
     frame = pl.read_csv(io.StringIO(body), separator=separator, infer_schema=infer, infer_schema_length=length)
@@ -192,21 +199,21 @@ def _table(lines: list[str], infer: bool) -> pl.DataFrame:
 
 
 def _refuse_shared_names(body: str, separator: str) -> None:
-    """Polars renames columns that share a name."""
+    """Refuse two columns of one name, which polars would rename."""
     first = pl.read_csv(io.StringIO(body), separator=separator, has_header=False, n_rows=1, infer_schema=False)
     counts = Counter(name.strip() for name in first.row(0) if name and name.strip())
     if shared := sorted(name for name, count in counts.items() if count > 1):
         raise ValueError(f"two columns have the same name: {', '.join(shared)}")
 
 
-def with_points(log: LogTable) -> pl.DataFrame:
+def with_decimal_points(log: LogTable) -> pl.DataFrame:
     """The table with numbers written another way made numbers: decimal commas, separated thousands.
 
     Decimal commas only where no number of the file has a decimal point. In a file separated by commas "1,234" may be a
     fraction or a thousand and more: unless another number decides, the table stays as it is.
     """
     texts = log.table.select(pl.col(pl.String).replace("", None))
-    fitting = {mark: _numbers(texts, mark) for mark in _MARKS}
+    fitting = {mark: _number_columns(texts, mark) for mark in _MARKS}
     numbers = set.union(*fitting.values())
     has_point = any(dtype.is_float() for dtype in log.table.schema.values())
     marks = [mark for mark, names in fitting.items() if names == numbers and not (mark == "," and has_point)]
@@ -216,7 +223,7 @@ def with_points(log: LogTable) -> pl.DataFrame:
     return log.table.with_columns(plain.str.replace(marks[0], ".", literal=True).cast(pl.Float64))
 
 
-def _numbers(texts: pl.DataFrame, mark: str) -> set[str]:
+def _number_columns(texts: pl.DataFrame, mark: str) -> set[str]:
     """The columns whose cells are all numbers with this decimal mark."""
     whole = rf"(?:[0-9]{{1,3}}(?:{_MARKS[mark]}[0-9]{{3}})+|[0-9]+)"
     number = rf"^\s*[+\-\u2212]?(?:{whole}(?:[{mark}][0-9]+)?|[{mark}][0-9]+)(?:[eE][+-]?[0-9]+)?\s*$"

@@ -11,7 +11,7 @@ import numpy as np
 import polars as pl
 
 from pipeline.read.ingest.fields import fields_of
-from pipeline.read.ingest.guesses import COLUMNS, ORIGIN, WORDS, columns_in, first, mapping_lines, word_of
+from pipeline.read.ingest.guesses import COLUMNS, ORIGIN, WORDS, columns_in, first_fitting, mapping_lines, word_of
 from pipeline.read.ingest.mcap_block import Block, Messages
 from pipeline.read.ingest.mcap_records import Channel
 from pipeline.read.ingest.mcap_run import LARGEST_MESSAGE, walk_log
@@ -109,7 +109,7 @@ def description_of(
         path=path,
         kind=kind,
         size_bytes=size_bytes,
-        streams=tuple(_summaries(run)) if run else (),
+        streams=tuple(_stream_summaries(run)) if run else (),
         topics=topics,
         left_over=left,
         notes=notes,
@@ -119,14 +119,16 @@ def description_of(
     )
 
 
-def _summaries(run: RunLog) -> Iterator[StreamSummary]:
+def _stream_summaries(run: RunLog) -> Iterator[StreamSummary]:
+    """Summaries of all streams, of GNSS by solution."""
     for stream in STREAMS:
         if (frame := run.stream(stream)) is not None:
             parts = frame.partition_by("solution", maintain_order=True) if stream == "gnss" else [frame]
-            yield from (_summary(stream, part) for part in parts)
+            yield from (_stream_summary(stream, part) for part in parts)
 
 
-def _summary(stream: Stream, frame: pl.DataFrame) -> StreamSummary:
+def _stream_summary(stream: Stream, frame: pl.DataFrame) -> StreamSummary:
+    """Times, rates, gaps and kinds of fix of one stream."""
     # Satellites share the time of their epoch: an epoch is one step.
     t_ns = frame.to_series(0).to_physical().drop_nulls().to_numpy()
     ordered = np.diff(np.unique(t_ns))
@@ -167,6 +169,7 @@ class Census:
         self.counts: dict[int, _ChannelCounts] = {}
 
     def add(self, block: Block, channels: Mapping[int, Channel]) -> None:
+        """Count these messages, and look at the first of each channel."""
         for channel_id, messages in block.items():
             if channel_id not in self.counts:
                 fields = _fields(channels[channel_id], messages) if len(self.counts) < _MOST_SAMPLES else {}
@@ -189,34 +192,36 @@ def _fields(channel: Channel, messages: Messages) -> Mapping[str, str]:
 
 def topics_of(paths: Sequence[Address], config: IngestConfig) -> tuple[TopicSummary, ...]:
     """All topics of a log, in one or several files, as far as it can be read; of damage it says nothing."""
-    return topics_in([_census_of(path, config) for path in paths], config)
+    return topics_in([_count_log(path, config) for path in paths], config)
 
 
 def topics_in(logs: Sequence[Census], config: IngestConfig) -> tuple[TopicSummary, ...]:
     """All topics that were counted, in one or several files of a log."""
     if len(logs) == 1:
-        return tuple(_topic(logs[0].counts[channel_id], config) for channel_id in sorted(logs[0].counts))
+        return tuple(_topic_summary(logs[0].counts[channel_id], config) for channel_id in sorted(logs[0].counts))
     joined: dict[tuple[str, str, str], _ChannelCounts] = {}
     for counted in (counted for census in logs for counted in census.counts.values()):
         key = (counted.channel.topic, counted.channel.schema_name, counted.channel.encoding)
         before = joined.setdefault(key, _ChannelCounts(counted.channel, counted.fields))
         before.messages += counted.messages
         before.span_ns += counted.span_ns
-    return tuple(_topic(joined[key], config) for key in sorted(joined))
+    return tuple(_topic_summary(joined[key], config) for key in sorted(joined))
 
 
-def _census_of(path: Address, config: IngestConfig) -> Census:
+def _count_log(path: Address, config: IngestConfig) -> Census:
+    """Counts of a log as far as it can be walked."""
     census = Census()
     with suppress(InputError):
         walk_log(path, config, census)
     return census
 
 
-def _topic(counted: _ChannelCounts, config: IngestConfig) -> TopicSummary:
+def _topic_summary(counted: _ChannelCounts, config: IngestConfig) -> TopicSummary:
+    """What would be made of a topic."""
     sample = Sample(counted.channel, counted.fields)
     span_s = (max(counted.span_ns) - min(counted.span_ns)) / 1e9
     sources = sources_of(sample, config) if counted.fields else []
-    source = next((source for source in sources if not source.dropped), None)
+    source = next((source for source in sources if not source.is_dropped), None)
     mapping = {}
     if source is not None:
         mapping = {name: " + ".join(time.fields) for name, time in source.times.items()}
@@ -239,13 +244,14 @@ def _topic(counted: _ChannelCounts, config: IngestConfig) -> TopicSummary:
 
 def starting_config(topics: Sequence[TopicSummary]) -> str:
     """Configuration text that maps what is left over, as far as names allow a guess; to be checked."""
-    parts = [part for topic in topics if topic.stream is None and topic.fields for part in (_suggestion(topic),)]
+    parts = [part for topic in topics if topic.stream is None and topic.fields for part in (_suggested_mapping(topic),)]
     if not parts:
         return ""
     return "# Check every line: names tell neither units nor whether a height is ellipsoidal.\n\n" + "\n".join(parts)
 
 
-def _suggestion(topic: TopicSummary) -> str:
+def _suggested_mapping(topic: TopicSummary) -> str:
+    """Lines that would map a topic that is left over."""
     if recipe := next((recipe for recipe in recipes_for(topic.schema, topic.topic) if recipe.only_mapped), None):
         written = [f"[[ingest.{recipe.stream}]]", f"topic = {json.dumps(topic.topic, ensure_ascii=False)}"]
         remark = (
@@ -258,17 +264,18 @@ def _suggestion(topic: TopicSummary) -> str:
     for stream in COLUMNS:
         if lines := mapping_lines(stream, topic.topic, words, time, None, {}):
             used = set(columns_in(stream, words).values())
-            return "\n".join([*lines, f"# other fields: {_others(topic.fields, used)}\n"])
+            return "\n".join([*lines, f"# other fields: {_other_fields(topic.fields, used)}\n"])
     named = {path: word_of(path.split(".")[-1]) for path, kind in topic.fields.items() if kind in ("int", "text")}
-    if balise := first(named, WORDS["balise"]):
+    if balise := first_fitting(named, WORDS["balise"]):
         head = ["[[ingest.balise_reads]]", f"topic = {json.dumps(topic.topic, ensure_ascii=False)}", *time]
         fields = f"fields = {{ balise_id = {json.dumps(balise, ensure_ascii=False)} }}"
-        return "\n".join([*head, fields, f"# other fields: {_others(topic.fields, {balise})}\n"])
+        return "\n".join([*head, fields, f"# other fields: {_other_fields(topic.fields, {balise})}\n"])
     return (
         f'# [[ingest.STREAM]]\n# topic = "{topic.topic}"  # {topic.schema or "no schema"}\n'
-        f"# fields: {_others(topic.fields, set())}\n"
+        f"# fields: {_other_fields(topic.fields, set())}\n"
     )
 
 
-def _others(fields: Mapping[str, str], used: set[str]) -> str:
+def _other_fields(fields: Mapping[str, str], used: set[str]) -> str:
+    """Fields that a suggestion does not use."""
     return ", ".join(path for path in list(fields)[:30] if path not in used)

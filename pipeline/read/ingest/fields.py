@@ -34,6 +34,7 @@ def _protobuf_class(schema: Schema) -> Any:
 
 
 def _ros_definitions(schema: Schema) -> tuple[Mapping[str, Definition], str]:
+    """Definitions of a ROS 2 schema, and the short name of its message."""
     definitions = parse_definitions(schema.name, schema.data.decode())
     name = short_name(schema.name)
     if name not in definitions:
@@ -85,21 +86,22 @@ def fields_of(channel: Channel, messages: Messages) -> dict[str, str]:
     few = int((messages.length[:_SAMPLED].cumsum() < _SAMPLED_BYTES).sum()) if channel.encoding == "json" else 1
     for row in range(max(few, 1)):
         try:
-            found = dict(_fields(channel, messages.payload(row)))
+            found = dict(_fields_of_message(channel, messages.payload(row)))
         except UndecodableError as error:
             raise undecodable(channel, messages.log_time[row], error) from None
         fields |= {path: kind for path, kind in found.items() if fields.get(path, "null") == "null"}
     return fields
 
 
-def _fields(channel: Channel, payload: bytes) -> Iterator[tuple[str, str]]:
+def _fields_of_message(channel: Channel, payload: bytes) -> Iterator[tuple[str, str]]:
+    """Paths of the fields of one message, with their kinds."""
     if channel.encoding == "json":
-        return _leaves(parse_json(payload), "", 0)
+        return _plain_values(parse_json(payload), "", 0)
     definition = definition_of(channel)
     if channel.encoding == "cdr":
         return RosWalk(payload, *definition).kinds()
     try:
-        return _leaves(definition.FromString(payload), "", 0)
+        return _plain_values(definition.FromString(payload), "", 0)
     except DecodeError as error:
         raise UndecodableError(f"not the protobuf message of its schema: {error}") from None
 
@@ -112,15 +114,15 @@ def may_follow(channel: Channel, path: str) -> bool:
         (step, isinstance(after, int)) for step, after in zip(steps, followers, strict=True) if isinstance(step, str)
     ]
     if channel.encoding == "protobuf":
-        return _in_protobuf(definition_of(channel).DESCRIPTOR, named)
+        return _knows_protobuf_path(definition_of(channel).DESCRIPTOR, named)
     if channel.encoding != "cdr":
         return False
     definitions, kind = definition_of(channel)
-    return _in_ros(definitions, kind, named)
+    return _knows_ros_path(definitions, kind, named)
 
 
-def _in_protobuf(descriptor: Any, named: Sequence[tuple[str, bool]]) -> bool:
-    """`named`: the names of a path, and whether an index stands behind each."""
+def _knows_protobuf_path(descriptor: Any, named: Sequence[tuple[str, bool]]) -> bool:
+    """Whether a descriptor knows a path; `named`: its names, and whether an index stands behind each."""
     for name, indexed in named:
         field = descriptor.fields_by_name.get(name) if descriptor is not None else None
         if field is None or field.is_repeated != indexed:
@@ -129,7 +131,8 @@ def _in_protobuf(descriptor: Any, named: Sequence[tuple[str, bool]]) -> bool:
     return descriptor is None
 
 
-def _in_ros(definitions: Mapping[str, Definition], kind: str, named: Sequence[tuple[str, bool]]) -> bool:
+def _knows_ros_path(definitions: Mapping[str, Definition], kind: str, named: Sequence[tuple[str, bool]]) -> bool:
+    """Whether definitions know a path to a plain value, through arrays of fixed size alone."""
     for name, indexed in named:
         member = next((member for member in definitions.get(kind, ()) if member.name == name), None)
         # Elements of an array of fixed size are in every message.
@@ -139,19 +142,20 @@ def _in_ros(definitions: Mapping[str, Definition], kind: str, named: Sequence[tu
     return kind not in definitions
 
 
-def _leaves(value: Any, path: str, depth: int) -> Iterator[tuple[str, str]]:
+def _plain_values(value: Any, path: str, depth: int) -> Iterator[tuple[str, str]]:
+    """Paths and kinds of the plain values below a value."""
     if depth > _DEEPEST:
         return
-    children = _children(value)
+    children = _named_parts(value)
     if children is None:
-        yield path, _kind(value)
+        yield path, _kind_of_value(value)
         return
     for name, child in children:
         joined = f"{path}{name}" if name.startswith("[") or not path else f"{path}.{name}"
-        yield from _leaves(child, joined, depth + 1)
+        yield from _plain_values(child, joined, depth + 1)
 
 
-def _children(value: Any) -> list[tuple[str, Any]] | None:
+def _named_parts(value: Any) -> list[tuple[str, Any]] | None:
     """Named parts of a message or list; none for a plain value."""
     if isinstance(value, dict):
         return [(str(name), child) for name, child in value.items()]
@@ -166,6 +170,7 @@ def _children(value: Any) -> list[tuple[str, Any]] | None:
     return [(f"[{index}]", child) for index, child in enumerate(list(value[:_LARGEST_LIST]))]
 
 
-def _kind(value: Any) -> str:
+def _kind_of_value(value: Any) -> str:
+    """Kind of a plain value: `flag`, `int`, `float`, `null` or `text`."""
     kinds = {bool: "flag", int: "int", float: "float", type(None): "null"}
     return next((name for kind, name in kinds.items() if isinstance(value, kind)), "text")

@@ -62,7 +62,7 @@ def zone_in(name: str) -> tuple[str | None, str]:
     words = re.findall(r"[^\W_]+", re.sub(r"(?i)(?<=local|lokal)(?=time|zeit)|(?<=orts)(?=zeit)", " ", apart))
     declared = [word for word in words if re.fullmatch(ZONES["local"] + "|orts", word.lower())]
     bracket = re.search(r"[\[(<]\s*([^\])>]*?)\s*[\])>]", name)
-    if not declared and bracket and not all(re.fullmatch(ZONES["utc"], word) for word in _words(bracket[1])):
+    if not declared and bracket and not all(re.fullmatch(ZONES["utc"], word) for word in _split_words(bracket[1])):
         return bracket[1], name.replace(bracket[0], "")
     return " ".join(declared) or None, " ".join(word for word in words if word not in declared) if declared else name
 
@@ -72,18 +72,19 @@ def words_of_times(names: Iterable[str]) -> dict[str, str]:
     return {name: word_of(rest) or "zeit" * bool(zone) for name in names for zone, rest in (zone_in(name),)}
 
 
-def _words(text: str) -> list[str]:
+def _split_words(text: str) -> list[str]:
+    """Words of a text in small letters."""
     return re.findall(r"[^\W_]+", text.lower())
 
 
-def first(words: Mapping[str, str], pattern: str) -> str | None:
+def first_fitting(words: Mapping[str, str], pattern: str) -> str | None:
     """The first name whose word fits."""
     return next((name for name, word in words.items() if re.fullmatch(pattern, word)), None)
 
 
 def columns_in(stream: Stream, words: Mapping[str, str]) -> dict[str, str]:
     """Stream column to recorded name."""
-    return {column: name for column, pattern in COLUMNS[stream].items() if (name := first(words, pattern))}
+    return {column: name for column, pattern in COLUMNS[stream].items() if (name := first_fitting(words, pattern))}
 
 
 def unit_in(name: str) -> str | None:

@@ -49,7 +49,7 @@ class JsonDecoder:
             for step in above:
                 node = node.setdefault("[]" if isinstance(step, int) else step, {})
             node["[]" if isinstance(last, int) else last] = _ARROW[type(dtype)]
-        self._schema = pa.schema(list(_struct(tree)))
+        self._schema = pa.schema(list(_arrow_fields(tree)))
         self._first_schema: pa.Schema | None = None  # what of it the first messages held, while no other has held more
         self._narrow = True
         self._typed: TypedMessages | None = None  # while all messages hold what the first did
@@ -94,28 +94,29 @@ class JsonDecoder:
                 return columns
             self._typed = None
         try:
-            table = self._parsed(texts.content) if texts.are_plain() else None
+            table = self._parse_with_arrow(texts.content) if texts.are_plain() else None
         except pa.ArrowInvalid:
             return None
-        return self._columns(table) if table is not None and table.num_rows == len(texts) else None
+        return self._columns_of_table(table) if table is not None and table.num_rows == len(texts) else None
 
-    def _columns(self, table: pa.Table) -> Columns:
+    def _columns_of_table(self, table: pa.Table) -> Columns:
+        """The fields that were asked for, null where no message has them."""
         frame = pl.DataFrame(pl.from_arrow(table))
         present = {path: dtype for path, dtype in self._types.items() if parse_path(path)[0] in frame.columns}
-        columns: dict[str, Values] = {**frame.select(_value(path).alias(path) for path in present).to_dict()}
+        columns: dict[str, Values] = {**frame.select(_value_expression(path).alias(path) for path in present).to_dict()}
         for path, dtype in self._types.items():
             if path not in present:
                 columns[path] = pl.Series([None], dtype=dtype).new_from_index(0, len(table))
         return columns
 
-    def _parsed(self, content: bytearray) -> pa.Table:
+    def _parse_with_arrow(self, content: bytearray) -> pa.Table:
         """Without the columns that the first messages lacked, as long as none has more: each costs a message time."""
         if self._first_schema is not None:
             try:
-                return _read(content, self._first_schema, "error")
+                return _read_with_arrow(content, self._first_schema, "error")
             except pa.ArrowInvalid:
                 self._first_schema = None
-        table = _read(content, self._schema, "ignore")
+        table = _read_with_arrow(content, self._schema, "ignore")
         if self._narrow:
             self._narrow = False
             filled = [field for field in self._schema if table[field.name].null_count < len(table)]
@@ -133,13 +134,14 @@ def one_by_one(
         try:
             document = parse_json(payload)
             for path, dtype in types.items():
-                values[path].append(_fitting(_at(document, steps[path]), dtype))
+                values[path].append(_fit_value(_value_at(document, steps[path]), dtype))
         except UndecodableError as error:
             raise undecodable(channel, log_time, error) from None
     return {path: pl.Series(path, column, dtype=types[path]) for path, column in values.items()}
 
 
-def _read(content: bytearray, schema: pa.Schema, unexpected: Literal["error", "ignore"]) -> pa.Table:
+def _read_with_arrow(content: bytearray, schema: pa.Schema, unexpected: Literal["error", "ignore"]) -> pa.Table:
+    """JSON lines as a table of this schema."""
     return pa.json.read_json(
         pa.BufferReader(content),
         read_options=pa.json.ReadOptions(use_threads=False, block_size=len(content) + 1),
@@ -147,17 +149,20 @@ def _read(content: bytearray, schema: pa.Schema, unexpected: Literal["error", "i
     )
 
 
-def _struct(tree: Mapping[str, Any]) -> list[pa.Field]:
-    return [pa.field(name, _type(node)) for name, node in tree.items()]
+def _arrow_fields(tree: Mapping[str, Any]) -> list[pa.Field]:
+    """Fields of a tree of names."""
+    return [pa.field(name, _arrow_type(node)) for name, node in tree.items()]
 
 
-def _type(node: Any) -> pa.DataType:
+def _arrow_type(node: Any) -> pa.DataType:
+    """Type of a node of a tree of names."""
     if not isinstance(node, dict):
         return node
-    return pa.list_(_type(node["[]"])) if "[]" in node else pa.struct(_struct(node))
+    return pa.list_(_arrow_type(node["[]"])) if "[]" in node else pa.struct(_arrow_fields(node))
 
 
-def _value(path: str) -> pl.Expr:
+def _value_expression(path: str) -> pl.Expr:
+    """Expression for the value at a path."""
     first, *steps = parse_path(path)
     value = pl.col(str(first))
     for step in steps:
@@ -212,6 +217,7 @@ def _with_byte_before(messages: Messages) -> memoryview:
 
 
 def _is_utf8(content: bytearray) -> bool:
+    """Whether all bytes are UTF-8."""
     if content.isascii():
         return True
     try:
@@ -224,12 +230,12 @@ def _is_utf8(content: bytearray) -> bool:
 def parse_json(payload: bytes) -> Any:
     """One JSON document; literals that are not JSON (NaN, Infinity) and doubled names are refused."""
     try:
-        return json.loads(payload, parse_constant=_refuse_literal, object_pairs_hook=_object)
+        return json.loads(payload, parse_constant=_refuse_literal, object_pairs_hook=_object_without_doubles)
     except (ValueError, RecursionError) as error:
         raise UndecodableError(f"not JSON: {error}") from None
 
 
-def _object(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+def _object_without_doubles(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
     """An object; of two values under one name, nobody can say which is meant."""
     members = dict(pairs)
     if len(members) < len(pairs):
@@ -238,10 +244,11 @@ def _object(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
 
 
 def _refuse_literal(literal: str) -> Any:
+    """Refuse a literal that is not JSON."""
     raise ValueError(f"the literal {literal}")
 
 
-def _at(document: Any, steps: list[str | int]) -> Any:
+def _value_at(document: Any, steps: list[str | int]) -> Any:
     """The value at a path, none where there is none."""
     value = document
     for step in steps:
@@ -261,7 +268,7 @@ _KINDS: dict[type[pl.DataType], tuple[type, str]] = {
 }
 
 
-def _fitting(value: Any, dtype: pl.DataType) -> Any:
+def _fit_value(value: Any, dtype: pl.DataType) -> Any:
     """The value in the type asked for: whole numbers also serve as floats and as ids, which are texts, and floats that
     are whole as integers.
     """

@@ -53,15 +53,16 @@ class TypedMessages:
         self._types = types
         self._held: dict[str, str] = {}  # the attribute of each field that is there
         self._tokens = 0  # names and texts of a message
-        self._attributes(tree, "", "")
+        self._note_attributes(tree, "", "")
         self._error = msgspec.MsgspecError
-        self._decoder = msgspec.json.Decoder(_struct(tree))
+        self._decoder = msgspec.json.Decoder(_struct_type(tree))
 
-    def _attributes(self, tree: Mapping[str, Any], path: str, attribute: str) -> None:
+    def _note_attributes(self, tree: Mapping[str, Any], path: str, attribute: str) -> None:
+        """Note under which attribute each field is found, and how many tokens a message has."""
         for number, (name, node) in enumerate(tree.items()):
             self._tokens += 1
             if isinstance(node, dict):
-                self._attributes(node, f"{path}{name}.", f"{attribute}_{number}.")
+                self._note_attributes(node, f"{path}{name}.", f"{attribute}_{number}.")
             else:
                 self._tokens += node is str
                 self._held[f"{path}{name}"] = f"{attribute}_{number}"
@@ -78,7 +79,7 @@ class TypedMessages:
             messages = self._decoder.decode_lines(content)
             if len(messages) != count:
                 return None
-            columns = {path: self._column(path, dtype, messages) for path, dtype in self._types.items()}
+            columns = {path: self._column_of_field(path, dtype, messages) for path, dtype in self._types.items()}
         except (self._error, UnicodeDecodeError, OverflowError):  # the last of numbers beyond 64 bits
             return None
         real = [column for column in columns.values() if column.dtype == pl.Float64]
@@ -86,7 +87,8 @@ class TypedMessages:
             return None
         return columns
 
-    def _column(self, path: str, dtype: pl.DataType, messages: list[Any]) -> pl.Series:
+    def _column_of_field(self, path: str, dtype: pl.DataType, messages: list[Any]) -> pl.Series:
+        """The values of one field of all messages."""
         if path not in self._held:
             return pl.Series([None], dtype=dtype).new_from_index(0, len(messages))
         values = map(attrgetter(self._held[path]), messages)
@@ -98,11 +100,11 @@ class TypedMessages:
         return pl.Series(texts, dtype=dtype)
 
 
-def _struct(tree: Mapping[str, Any]) -> Any:
+def _struct_type(tree: Mapping[str, Any]) -> Any:
     """A type whose objects have all of these fields and no others."""
     import msgspec
 
-    kinds = [_struct(node) if isinstance(node, dict) else node for node in tree.values()]
+    kinds = [_struct_type(node) if isinstance(node, dict) else node for node in tree.values()]
     names = {f"_{number}": name for number, name in enumerate(tree)}
     fields = list(zip(names, kinds, strict=True))
     return msgspec.defstruct("Message", fields, rename=names, forbid_unknown_fields=True, gc=False)

@@ -20,7 +20,7 @@ from pipeline.read.ingest.fields import fields_of
 from pipeline.read.ingest.mcap_block import Block, Messages
 from pipeline.read.ingest.mcap_records import Channel, DamageError
 from pipeline.read.ingest.mcap_walk import McapWalk
-from pipeline.read.ingest.plan import Sample, Source, is_candidate, settle, solution_of, sources_of
+from pipeline.read.ingest.plan import Sample, Source, is_candidate, settle_sources, solution_of, sources_of
 from pipeline.read.ingest.reader import ORDINAL, SourceReader
 from pipeline.storage import files
 from pipeline.storage.address import Address, name_of, stem_of
@@ -229,7 +229,7 @@ def _frames(
     place = str(logs[0].path) if len(logs) == 1 else ", ".join(str(log.path) for log in logs)
     readers = [reader for log in logs for of_channel in log.streams.readers.values() for reader in of_channel]
     met = [log.walk.channels[channel_id] for log in logs for channel_id in log.streams.readers]
-    settled = settle([reader.source for reader in readers], [c.topic for c in met], config, place, partly)
+    settled = settle_sources([reader.source for reader in readers], [c.topic for c in met], config, place, partly)
     chosen = [reader for reader in readers if any(reader.source is source for source in settled)]
     decoded = [DecodedRows(r.source, solution_of(r.source, settled), r.frame(), [*r.frames]) for r in chosen]
     used = {source.channel.topic for source in settled}

@@ -25,7 +25,7 @@ def read_folder(path: Address, config: IngestConfig, with_digest: bool = True) -
     present = set(files.list_dir(path))
     breaches: list[InputError] = []
     if "gnss.parquet" not in present:
-        breaches.append(_no_gnss(path, present))
+        breaches.append(_no_gnss_error(path, present))
     digest = hashlib.sha256()
     frames: dict[str, pl.DataFrame] = {}
     skipped: list[str] = []
@@ -42,7 +42,7 @@ def read_folder(path: Address, config: IngestConfig, with_digest: bool = True) -
             digest.update(f"{stream}:{len(content)}:".encode())
             digest.update(content)
         stored = _stored(content, str(file), breaches)
-        recorded = None if stored is None else _read(stored, stream, str(file), config, breaches)
+        recorded = None if stored is None else _read_stream(stored, stream, str(file), config, breaches)
         if stored is not None and recorded is not None:
             frames[stream] = conform(recorded, stream, str(file), breaches)
             if stream == "odometer" and not breaches:
@@ -51,7 +51,7 @@ def read_folder(path: Address, config: IngestConfig, with_digest: bool = True) -
             said = noted(stored.notes)
             held += read_corrections(said, stream, str(file))
             raw_logs += read_raw_logs(said)
-            damages += [*filter(None, [read_damage(said)]), *_lost(stream, stored.rows, recorded)]
+            damages += [*filter(None, [read_damage(said)]), *_missing_rows(stream, stored.rows, recorded)]
             unproved += [f"{stream}.parquet"] if stored.without_checksums else []
             skipped += [f"{stream}.parquet: column {name}" for name in recorded.columns if not _is_known(name, stream)]
     refuse(breaches)
@@ -70,14 +70,15 @@ def read_folder(path: Address, config: IngestConfig, with_digest: bool = True) -
     ).with_streams(**frames)
 
 
-def _lost(stream: Stream, declared: int, recorded: pl.DataFrame) -> list[str]:
+def _missing_rows(stream: Stream, declared: int, recorded: pl.DataFrame) -> list[str]:
     """Rows that a file declares and does not hold."""
     return [f"{stream}.parquet holds {recorded.height} of {declared} rows that are declared"] * (
         recorded.height < declared
     )
 
 
-def _no_gnss(path: Address, present: set[str]) -> InputError:
+def _no_gnss_error(path: Address, present: set[str]) -> InputError:
+    """The error for a folder without positions."""
     return InputError(
         "holds no GNSS stream",
         place=str(path),
@@ -99,19 +100,20 @@ def _stored(content: bytes, place: str, breaches: list[InputError]) -> TableFile
         return None
 
 
-def _read(
+def _read_stream(
     stored: TableFile, stream: Stream, place: str, config: IngestConfig, breaches: list[InputError]
 ) -> pl.DataFrame | None:
     """The columns of the contract, and those beside it without their values; None after a breach."""
     others: list[str] = []
 
-    def known(types: ColumnTypes) -> list[str]:
+    def known_columns(types: ColumnTypes) -> list[str]:
+        """Columns of the contract; names of the others are kept."""
         others.extend(name for name in types if not _is_known(name, stream))
         return [name for name in types if _is_known(name, stream)]
 
     try:
         refuse_too_many(stored.rows, place, config)
-        frame = stored.frame(known)
+        frame = stored.frame(known_columns)
     except ParquetError as error:
         breaches.append(_unreadable(error, place))
         return None

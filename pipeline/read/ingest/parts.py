@@ -99,7 +99,7 @@ def lines_of_parts(parts: Sequence[LogPart]) -> list[str]:
     for log in dict.fromkeys(part.log for part in parts):
         own = [part for part in parts if part.log == log]
         plural = _PLURALS[own[0].kind]
-        used = [_used(part) for part in own if part.used_as]
+        used = [_use_words(part) for part in own if part.used_as]
         unused = [
             f"{part.name} ({part.count})" if part.kind in ("topic", "message") else part.name
             for part in own
@@ -110,7 +110,8 @@ def lines_of_parts(parts: Sequence[LogPart]) -> list[str]:
     return lines
 
 
-def _used(part: LogPart) -> str:
+def _use_words(part: LogPart) -> str:
+    """What a part is used as, in words."""
     # Of a topic the stream; its columns are many.
     return part.name if part.kind == "message" else f"{part.name} as {part.used_as.partition(':')[0]}"
 

@@ -70,25 +70,25 @@ class Source:
         return self.frame in (*paths, *self.recipe.key)
 
     @property
-    def dropped(self) -> bool:
-        """A driver's optional message that is not as its recipe knows it: left over, not an error."""
+    def is_dropped(self) -> bool:
+        """Whether it is a driver's optional message that is not as its recipe knows it: left over, not an error."""
         optional = self.recipe.stream == "satellites" or self.recipe.supplement
         return bool(self.breaches) and optional and self.mapping is None and not self.recipe.own
 
 
 def sources_of(sample: Sample, config: IngestConfig) -> list[Source]:
     """What the channel may feed: by configuration, else by its schema."""
-    known = _by_schema(sample)
+    known = _source_by_schema(sample)
     sources: list[Source] = []
     for stream in STREAMS:
         mappings = mappings_of(config, stream)
         sources += [mapped_source(sample, stream, m) for m in mappings if m.topic == sample.channel.topic]
-        if known is not None and known.recipe.stream == stream and _by_itself(known.recipe, bool(mappings)):
+        if known is not None and known.recipe.stream == stream and _needs_no_mapping(known.recipe, bool(mappings)):
             sources.append(known)
     return sources
 
 
-def _by_itself(recipe: Recipe, is_mapped: bool) -> bool:
+def _needs_no_mapping(recipe: Recipe, is_mapped: bool) -> bool:
     """Whether the schema alone makes the stream, in a log of whose stream some topic `is_mapped` or not."""
     return not recipe.only_mapped and (not is_mapped or recipe.supplement)
 
@@ -99,9 +99,9 @@ def is_candidate(channel: Channel, config: IngestConfig) -> bool:
     return mapped or any(not recipe.only_mapped for recipe in recipes_for(channel.schema_name, channel.topic))
 
 
-def _by_schema(sample: Sample) -> Source | None:
+def _source_by_schema(sample: Sample) -> Source | None:
     """By the first recipe of the schema whose fields are all there, else by the first at all."""
-    known = [_source(sample, recipe) for recipe in recipes_for(sample.channel.schema_name, sample.channel.topic)]
+    known = [_make_source(sample, recipe) for recipe in recipes_for(sample.channel.schema_name, sample.channel.topic)]
     return next((source for source in known if not source.breaches), known[0] if known else None)
 
 
@@ -109,12 +109,12 @@ def mapped_source(sample: Sample, stream: Stream, mapping: StreamMapping) -> Sou
     """The source that the configuration makes of a channel."""
     if mapping.time_zone is not None and sample.channel.encoding != "csv":
         raise InputError("time_zone is for CSV: other logs count their times", place=sample.channel.place)
-    known = _by_schema(sample)
+    known = _source_by_schema(sample)
     recipe = mapped_recipe(known.recipe if known else None, sample.fields, stream, mapping)
-    return _source(sample, recipe, mapping)
+    return _make_source(sample, recipe, mapping)
 
 
-def _source(sample: Sample, recipe: Recipe, mapping: StreamMapping | None = None) -> Source:
+def _make_source(sample: Sample, recipe: Recipe, mapping: StreamMapping | None = None) -> Source:
     """How the channel's messages make rows; `breaches` tells what they lack."""
     contract = STREAM_SCHEMAS[recipe.stream].columns()
     closed = sample.channel.encoding != "json"  # JSON messages may leave keys out one by one
@@ -122,29 +122,29 @@ def _source(sample: Sample, recipe: Recipe, mapping: StreamMapping | None = None
     breaches: list[InputError] = []
     doubtful: dict[str, str] = {}
     for name, expression in recipe.columns.items():
-        absent = [path for path in recipe.fields_of(name) if not _is_there(sample, recipe, path)]
+        absent = [path for path in recipe.fields_of(name) if not _has_field(sample, recipe, path)]
         wanted = mapping is not None and name in mapping.fields
         optional = not closed and (contract[name].nullable or name in DEFAULTS)
-        if optional or all(_may_follow(sample, recipe, path) for path in absent):
+        if optional or all(_may_have_field(sample, recipe, path) for path in absent):
             columns[name] = expression
             if absent and (wanted or (name in _POSITION and not recipe.own)):
                 doubtful[name] = absent[0]
         elif wanted or not (contract[name].nullable or name in DEFAULTS):
-            breaches.append(missing_field(sample.channel, sample.fields, name, absent))
+            breaches.append(missing_field_error(sample.channel, sample.fields, name, absent))
     if recipe.rows and sample.channel.encoding != "cdr":
         breaches.append(InputError("holds arrays, which are read of cdr only", place=sample.channel.place))
-    times = _times(sample, recipe, mapping, breaches)
+    times = _time_sources(sample, recipe, mapping, breaches)
     paths = dict.fromkeys([*recipe.key, *(path for name in columns for path in recipe.fields_of(name))])
     types = {path: recipe.type_of(path) for path in paths}
     for time in times.values():
         types |= time.types
     implicit = _without_presence(sample.channel, columns) if recipe.own else ()
-    frame = _frame_of_speed(sample, columns.get("speed_mps"), mapping, breaches)
+    frame = _speed_frame_field(sample, columns.get("speed_mps"), mapping, breaches)
     types |= {frame: pl.String()} if frame else {}
     return Source(sample.channel, recipe, mapping, columns, times, types, breaches, doubtful, implicit, frame)
 
 
-def _frame_of_speed(
+def _speed_frame_field(
     sample: Sample, speed: pl.Expr | None, mapping: StreamMapping | None, breaches: list[InputError]
 ) -> str:
     """The field with the frame of a speed that is one component of a vector; empty where the mapping gives it."""
@@ -153,7 +153,7 @@ def _frame_of_speed(
         return ""
     if mapping is not None and mapping.frame is not None:
         if is_world_frame(mapping.frame):
-            breaches.append(world_frame(sample.channel, roots[0], mapping.frame))
+            breaches.append(world_frame_error(sample.channel, roots[0], mapping.frame))
         return ""
     # A twist is in the frame of the child where a message has one (REP 105, nav_msgs/Odometry).
     return next((name for name in _FRAMES if sample.fields.get(name) == "text"), "")
@@ -164,7 +164,7 @@ def is_world_frame(frame: str) -> bool:
     return re.fullmatch(_WORLD, frame.strip("/ ").rpartition("/")[2].lower()) is not None
 
 
-def world_frame(channel: Channel, path: str, frame: str) -> InputError:
+def world_frame_error(channel: Channel, path: str, frame: str) -> InputError:
     """A component of a velocity in the world, which is no speed of the train."""
     vector = path.rpartition(".")[0]
     return InputError(
@@ -185,17 +185,18 @@ def _without_presence(channel: Channel, columns: Iterable[str]) -> tuple[str, ..
     return tuple(name for name in columns if name in known and not known[name].has_presence)
 
 
-def _is_there(sample: Sample, recipe: Recipe, path: str) -> bool:
+def _has_field(sample: Sample, recipe: Recipe, path: str) -> bool:
+    """Whether the first message has the field of a path."""
     return path in sample.fields or f"{recipe.rows}[0].{path}" in sample.fields
 
 
-def _may_follow(sample: Sample, recipe: Recipe, path: str) -> bool:
-    """A field of later messages: the first says nothing about the elements of an array that is empty in it."""
+def _may_have_field(sample: Sample, recipe: Recipe, path: str) -> bool:
+    """Whether later messages may have the field: the first says nothing of elements of an array that is empty in it."""
     in_element = f"{recipe.rows}[0].{path}"
     return may_follow(sample.channel, path) or (bool(recipe.rows) and may_follow(sample.channel, in_element))
 
 
-def missing_field(channel: Channel, fields: Iterable[str], column: str, absent: Sequence[str]) -> InputError:
+def missing_field_error(channel: Channel, fields: Iterable[str], column: str, absent: Sequence[str]) -> InputError:
     """The error for a column whose fields the messages lack."""
     return InputError(
         f"has no field {', '.join(absent)} for column {column}",
@@ -205,19 +206,19 @@ def missing_field(channel: Channel, fields: Iterable[str], column: str, absent: 
     )
 
 
-def _times(
+def _time_sources(
     sample: Sample, recipe: Recipe, mapping: StreamMapping | None, breaches: list[InputError]
 ) -> dict[str, TimeSource | CivilTime]:
     """The time of validity, and further times (end of a fault), which look like it and may be absent."""
     if recipe.time is not None and (mapping is None or mapping.time == "auto"):
         return {"t": recipe.time}
     (column, path), *others = (recipe.stamps or {"t": ""}).items()
-    first = _time(sample, path, mapping, breaches)
+    first = _time_source(sample, path, mapping, breaches)
     extra = {name: first.of_field(path, other) for name, other in others}
     return {column: first, **extra}
 
 
-def _time(sample: Sample, path: str, mapping: StreamMapping | None, breaches: list[InputError]) -> TimeSource:
+def _time_source(sample: Sample, path: str, mapping: StreamMapping | None, breaches: list[InputError]) -> TimeSource:
     """The time of validity: as configured, else the payload's stamp, else the log time."""
     wanted = mapping.time if mapping else "auto"
     log_time = time_source((LOG_TIME,), {LOG_TIME: "int"}, mapping)
@@ -236,11 +237,11 @@ def _time(sample: Sample, path: str, mapping: StreamMapping | None, breaches: li
             breaches.append(InputError("is not a time", place=place, found=unfit[0], expected="numbers or text"))
             return log_time
     if named:
-        breaches.append(missing_field(sample.channel, sample.fields, "t", [named]))
+        breaches.append(missing_field_error(sample.channel, sample.fields, "t", [named]))
     return log_time
 
 
-def settle(
+def settle_sources(
     sources: Sequence[Source], topics: Sequence[str], config: IngestConfig, file: str, partly: bool = False
 ) -> list[Source]:
     """The sources that stand, once all channels are known; raises for what is missing or in doubt.
@@ -250,11 +251,11 @@ def settle(
     breaches = [] if partly else absent_topics(topics, config, file)
     kept: list[Source] = []
     for stream in STREAMS:
-        chosen = _preferred([s for s in sources if s.recipe.stream == stream and not s.dropped])
+        chosen = _preferred_sources([s for s in sources if s.recipe.stream == stream and not s.is_dropped])
         if stream == "gnss":
             _refuse_shared_solutions(chosen)
         elif stream != "satellites":
-            breaches += _competing(stream, chosen, file)
+            breaches += _competing_sources(stream, chosen, file)
         breaches += [breach for source in chosen for breach in source.breaches]
         kept += chosen
     refuse(breaches)
@@ -276,7 +277,7 @@ def absent_topics(topics: Collection[str], config: IngestConfig, file: str) -> l
     ]
 
 
-def _preferred(sources: Sequence[Source]) -> list[Source]:
+def _preferred_sources(sources: Sequence[Source]) -> list[Source]:
     """This project's own schema alone where it is present; a supplement only with what it adds to."""
     of_project = [source for source in sources if source.recipe.own]
     if of_project:
@@ -299,7 +300,7 @@ def _refuse_shared_solutions(sources: Sequence[Source]) -> None:
             )
 
 
-def _competing(stream: Stream, sources: Sequence[Source], file: str) -> list[InputError]:
+def _competing_sources(stream: Stream, sources: Sequence[Source], file: str) -> list[InputError]:
     """GNSS may come from several topics, and odometers of which each names its sensor; nothing tells others apart."""
     topics = list(dict.fromkeys(source.channel.topic for source in sources))
     sensors = {source.mapping.constants.get("sensor") for source in sources if source.mapping}

@@ -48,16 +48,19 @@ def layout_by(descriptor: Any, types: Mapping[str, pl.DataType]) -> Callable[[by
         for step in parse_path(path):
             node = node.setdefault(step, {})
         node[""] = path
-    return partial(_layout, descriptor, tree, types)
+    return partial(_layout_of_message, descriptor, tree, types)
 
 
-def _layout(descriptor: Any, tree: Mapping[Any, Any], types: Mapping[str, pl.DataType], payload: bytes) -> Layout:
-    walk = _Walk(payload, types)
-    walk.message(descriptor, tree, 0, len(payload))
+def _layout_of_message(
+    descriptor: Any, tree: Mapping[Any, Any], types: Mapping[str, pl.DataType], payload: bytes
+) -> Layout:
+    """Where the wanted fields lie in this message."""
+    walk = _ProtobufWalk(payload, types)
+    walk.walk_message(descriptor, tree, 0, len(payload))
     return layout_of(payload, walk.static, walk.fields)
 
 
-class _Walk:
+class _ProtobufWalk:
     """The walk through one message; what is not wanted only shapes the layout."""
 
     def __init__(self, payload: bytes, types: Mapping[str, pl.DataType]) -> None:
@@ -66,7 +69,7 @@ class _Walk:
         self._payload = payload
         self._types = types
 
-    def message(self, descriptor: Any, tree: Mapping[Any, Any], start: int, end: int) -> None:
+    def walk_message(self, descriptor: Any, tree: Mapping[Any, Any], start: int, end: int) -> None:
         """The wanted fields of the message in this extent."""
         extents = self._scan(start, end)
         for step, subtree in tree.items():
@@ -75,21 +78,22 @@ class _Walk:
                 raise UndecodableError(f"no field {step}")
             places = extents.get(field.number, [])
             if field.is_repeated:
-                self._elements(field, subtree, self._unpacked(field.type, places))
+                self._walk_elements(field, subtree, self._unpacked(field.type, places))
             elif len(places) > 1:
                 raise UndecodableError(f"the field {step} occurs twice")
             elif places:
-                self._value(field, subtree, places[0])
+                self._walk_value(field, subtree, places[0])
             else:
                 self._absent(field, subtree)
 
-    def _value(self, field: Any, tree: Mapping[Any, Any], place: Raw) -> None:
+    def _walk_value(self, field: Any, tree: Mapping[Any, Any], place: Raw) -> None:
+        """Take a wanted field, or walk on into its message."""
         if field.type == _MESSAGE and place[0] == _LEN:
-            self.message(field.message_type, tree, *place[1:])
+            self.walk_message(field.message_type, tree, *place[1:])
         elif (path := tree.get("")) is None or len(tree) > 1:
             raise UndecodableError(f"the field {field.name} is no message")
         else:
-            self.fields[path] = [_field(field.type, *place).as_type(self._types[path])]
+            self.fields[path] = [_field_of_kind(field.type, *place).as_type(self._types[path])]
 
     def _scan(self, at: int, end: int) -> dict[int, list[Raw]]:
         """All fields of one message by number; tags, lengths and widths of varints are marked as static."""
@@ -131,12 +135,13 @@ class _Walk:
         elements: list[Raw] = []
         for wire, start, end in places:
             if wire == _LEN and kind not in (_STRING, _MESSAGE, _BYTES):
-                elements += self._packed(kind, start, end)
+                elements += self._packed_places(kind, start, end)
             else:
                 elements.append((wire, start, end))
         return elements
 
-    def _packed(self, kind: int, at: int, end: int) -> Iterator[Raw]:
+    def _packed_places(self, kind: int, at: int, end: int) -> Iterator[Raw]:
+        """Places of numbers that are packed side by side."""
         dtype = _FIXED_WIDTH.get(kind, "")
         while at < end:
             start = at
@@ -145,12 +150,13 @@ class _Walk:
                 raise UndecodableError("an array ends inside a number")
             yield _WIRE_OF_WIDTH[dtype[2:]], start, at
 
-    def _elements(self, field: Any, tree: Mapping[Any, Any], elements: list[Raw]) -> None:
+    def _walk_elements(self, field: Any, tree: Mapping[Any, Any], elements: list[Raw]) -> None:
+        """Take the wanted elements of an array; those that are not there are null."""
         for index, subtree in tree.items():
             if not isinstance(index, int):
                 raise UndecodableError(f"the field {field.name} is an array")
             if index < len(elements):
-                self._value(field, subtree, elements[index])
+                self._walk_value(field, subtree, elements[index])
             else:
                 self._null(subtree)
 
@@ -170,7 +176,8 @@ class _Walk:
                 self._null(node)
 
 
-def _field(kind: int, wire: int, start: int, end: int) -> Field:
+def _field_of_kind(kind: int, wire: int, start: int, end: int) -> Field:
+    """How a field of this kind is read at its place."""
     if kind in _FIXED_WIDTH and wire == _WIRE_OF_WIDTH[_FIXED_WIDTH[kind][2:]]:
         return fixed(start, _FIXED_WIDTH[kind])
     if kind == _STRING and wire == _LEN:
@@ -178,11 +185,11 @@ def _field(kind: int, wire: int, start: int, end: int) -> Field:
     if kind == _BOOL and wire == _VARINT and end - start == 1:
         return flag(start)
     if wire == _VARINT and (kind in _VARINTS or kind in _ZIGZAG):
-        return Field(pl.Int64, start, end, lambda blocks: _numbers(np.concatenate(blocks), kind))
+        return Field(pl.Int64, start, end, lambda blocks: _varint_values(np.concatenate(blocks), kind))
     raise UndecodableError("a field is written as another type than its schema says")
 
 
-def _numbers(septets: Bytes, kind: int) -> Values:
+def _varint_values(septets: Bytes, kind: int) -> Values:
     """Varints of one width."""
     total = np.zeros(len(septets), dtype=np.uint64)
     for place in range(septets.shape[1]):

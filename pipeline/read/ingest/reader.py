@@ -25,6 +25,7 @@ _TOGETHER = 4 * 1024 * 1024  # bytes that are decoded at once
 
 
 def _decoder_of(source: Source, with_publish_time: bool) -> JsonDecoder | LayoutDecoder:
+    """The decoder of a channel's encoding."""
     channel = source.channel
     if channel.encoding == "json":
         return JsonDecoder(channel, source.types, with_publish_time)

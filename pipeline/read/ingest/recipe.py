@@ -59,22 +59,23 @@ def fix_from(codes: pl.Expr, kinds: Mapping[int, Fix], known: pl.Expr | None = N
     return fix if known is None else pl.when(known).then(fix).otherwise(pl.lit(Fix.NONE.value).cast(FIX_TYPE))
 
 
-def places_of(status: pl.Expr) -> dict[str, pl.Expr]:
+def position_columns(status: pl.Expr) -> dict[str, pl.Expr]:
     """`latitude`, `longitude`, `altitude`; drivers write NaN where there is no fix (and only there it is no error)."""
     places = {
-        f"{name}_deg": unless((status < 0) & pl.col(name).is_nan(), pl.col(name)) for name in ("latitude", "longitude")
+        f"{name}_deg": null_where((status < 0) & pl.col(name).is_nan(), pl.col(name))
+        for name in ("latitude", "longitude")
     }
     return places | {"height_m": pl.col("altitude").fill_nan(None)}
 
 
-def deviations(east: str, north: str, up: str) -> dict[str, pl.Expr]:
+def covariance_of_deviations(east: str, north: str, up: str) -> dict[str, pl.Expr]:
     """A covariance of three deviations [m2], without correlation."""
     zero = pl.when(pl.col(north).is_not_null()).then(0.0)
     squares = {f"cov_{axis}{axis}_m2": pl.col(path) ** 2 for axis, path in zip("enu", (east, north, up), strict=True)}
     return squares | {f"cov_{axes}_m2": zero for axes in ("en", "eu", "nu")}
 
 
-def unless(condition: pl.Expr, value: pl.Expr) -> pl.Expr:
+def null_where(condition: pl.Expr, value: pl.Expr) -> pl.Expr:
     """The value, or null where the condition says that it is not known."""
     return pl.when(~condition).then(value)
 

@@ -8,7 +8,7 @@ import dataframely as dy
 import polars as pl
 
 from pipeline.read.ingest import recipes_drivers
-from pipeline.read.ingest.recipe import FIX_TYPE, Recipe, covariance_enu, fix_from, places_of
+from pipeline.read.ingest.recipe import FIX_TYPE, Recipe, covariance_enu, fix_from, position_columns
 from schemas.enums import Fix
 from schemas.inputs import STREAM_SCHEMAS
 from schemas.run import STREAMS, Stream
@@ -25,7 +25,7 @@ def _navsatfix() -> Recipe:
     return Recipe(
         stream="gnss",
         columns={
-            **places_of(status),
+            **position_columns(status),
             "fix": fix_from(status, _NAVSAT_FIX),
             **covariance_enu(pl.col("position_covariance_type") > 0),
         },

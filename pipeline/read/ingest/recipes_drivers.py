@@ -11,7 +11,15 @@ import math
 import polars as pl
 
 from pipeline.read.ingest import novatel
-from pipeline.read.ingest.recipe import FIX_TYPE, Recipe, covariance_enu, deviations, fix_from, places_of, unless
+from pipeline.read.ingest.recipe import (
+    FIX_TYPE,
+    Recipe,
+    covariance_enu,
+    covariance_of_deviations,
+    fix_from,
+    null_where,
+    position_columns,
+)
 from pipeline.read.ingest.stamps import CivilTime
 from schemas.enums import Fix
 
@@ -26,25 +34,26 @@ SBF_FIXES = {
 _SBF_KEY = ("block_header.wnc", "block_header.tow")
 
 
-def _sbf(path: str) -> pl.Expr:
+def _sbf_float(path: str) -> pl.Expr:
     """A float of an SBF block; -2e10 means "do not use"."""
-    return unless(pl.col(path) < -1e10, pl.col(path))
+    return null_where(pl.col(path) < -1e10, pl.col(path))
 
 
 def _pvt_geodetic() -> Recipe:
+    """septentrio_gnss_driver/msg/PVTGeodetic: position, velocity, kind of fix."""
     mode = pl.col("mode") & 0x0F
     sbas = mode == 6
     return Recipe(
         stream="gnss",
         columns={
-            "latitude_deg": _sbf("latitude") * _RAD,
-            "longitude_deg": _sbf("longitude") * _RAD,
-            "height_m": _sbf("height"),
-            "vel_e_mps": _sbf("ve"),
-            "vel_n_mps": _sbf("vn"),
-            "vel_u_mps": _sbf("vu"),
+            "latitude_deg": _sbf_float("latitude") * _RAD,
+            "longitude_deg": _sbf_float("longitude") * _RAD,
+            "height_m": _sbf_float("height"),
+            "vel_e_mps": _sbf_float("ve"),
+            "vel_n_mps": _sbf_float("vn"),
+            "vel_u_mps": _sbf_float("vu"),
             "fix": fix_from(mode, SBF_FIXES, known=pl.col("error") == 0),
-            "satellites": unless(pl.col("nr_sv") == 255, pl.col("nr_sv")),
+            "satellites": null_where(pl.col("nr_sv") == 255, pl.col("nr_sv")),
             "sbas_prn": pl.when(sbas & (pl.col("reference_id") != 65535)).then(pl.col("reference_id")),
             "sbas_age_s": pl.when(sbas & (pl.col("mean_corr_age") != 65535)).then(pl.col("mean_corr_age") * 0.01),
         },
@@ -54,12 +63,13 @@ def _pvt_geodetic() -> Recipe:
 
 
 def _pos_cov_geodetic() -> Recipe:
+    """septentrio_gnss_driver/msg/PosCovGeodetic: the covariance of the position of the same epoch."""
     names = {
         "ee": "lonlon", "en": "latlon", "eu": "lonhgt", "nn": "latlat", "nu": "lathgt", "uu": "hgthgt",
     }  # fmt: skip
     return Recipe(
         stream="gnss",
-        columns={f"cov_{axes}_m2": _sbf(f"cov_{name}") for axes, name in names.items()},
+        columns={f"cov_{axes}_m2": _sbf_float(f"cov_{name}") for axes, name in names.items()},
         whole=_SBF_KEY,
         key=_SBF_KEY,
         supplement=True,
@@ -154,7 +164,7 @@ def _bestpos() -> Recipe:
             "latitude_deg": pl.col("lat"),
             "longitude_deg": pl.col("lon"),
             "height_m": pl.col("hgt") + pl.col("undulation"),
-            **deviations("lon_stdev", "lat_stdev", "hgt_stdev"),
+            **covariance_of_deviations("lon_stdev", "lat_stdev", "hgt_stdev"),
             "fix": fix_from(pl.col("pos_type.type"), novatel.FIX_BY_CODE, known=pl.col("sol_status.status") == 0),
             "satellites": pl.col("num_sol_svs"),
         },
@@ -170,13 +180,14 @@ _GPS_STATUS = {
 
 
 def _gps_fix() -> Recipe:
+    """gps_msgs/msg/GPSFix: speed and track as velocity; NaN where not known."""
     status = pl.col("status.status")
     heading = pl.col("track").fill_nan(None).radians()
     speed = pl.col("speed").fill_nan(None)
     return Recipe(
         stream="gnss",
         columns={
-            **places_of(status),
+            **position_columns(status),
             "vel_e_mps": speed * heading.sin(),
             "vel_n_mps": speed * heading.cos(),
             "vel_u_mps": pl.col("climb").fill_nan(None),

@@ -50,7 +50,7 @@ def parse_definitions(name: str, text: str) -> Mapping[str, Definition]:
     """All messages of a concatenated definition by short name (`pkg/Type`); constants are left out."""
     by_short_name: dict[str, Definition] = {}
     for full, lines in _sections(name, text):
-        members = tuple(member for line in lines if (member := _member(line, full.split("/")[0])))
+        members = tuple(member for line in lines if (member := _parse_member(line, full.split("/")[0])))
         if len({member.name for member in members}) < len(members):
             raise DefinitionError(f"{full} names a field twice")
         if by_short_name.setdefault(short_name(full), members) != members:
@@ -79,7 +79,8 @@ def short_name(full: str) -> str:
     return f"{parts[0]}/{parts[-1]}"
 
 
-def _member(line: str, package: str) -> Member | None:
+def _parse_member(line: str, package: str) -> Member | None:
+    """The field that a line defines; None for comments, constants and empty lines."""
     content = line.split("#", 1)[0].strip()
     match = _LINE.fullmatch(content)
     if not content or (match and match["rest"].lstrip().startswith("=")):
@@ -120,7 +121,7 @@ class RosWalk:
         self._payload = payload
         self._definitions = definitions
         self._at = HEADER_SIZE
-        self._message(name, "", 0)
+        self._walk_message(name, "", 0)
 
     def kinds(self) -> Iterator[tuple[str, str]]:
         """The fields with their kind: `int`, `float`, `text`, `flag`."""
@@ -132,57 +133,63 @@ class RosWalk:
             else:
                 yield from ((f"{path}[{index}]", kind) for index in range(min(place.size, _MOST_SHOWN)))
 
-    def _message(self, name: str, path: str, depth: int) -> None:
+    def _walk_message(self, name: str, path: str, depth: int) -> None:
+        """Walk through the members of a message."""
         if name not in self._definitions or depth > DEEPEST:
             raise UndecodableError(f"no definition of {name}")
         members = self._definitions[name]
         if not members:
-            self._take(1, 1)  # IDL knows no empty structure: ROS 2 puts one byte there
+            self._take_bytes(1, 1)  # IDL knows no empty structure: ROS 2 puts one byte there
         for member in members:
-            self._member(member, f"{path}.{member.name}" if path else member.name, depth)
+            self._walk_member(member, f"{path}.{member.name}" if path else member.name, depth)
 
-    def _member(self, member: Member, path: str, depth: int) -> None:
+    def _walk_member(self, member: Member, path: str, depth: int) -> None:
+        """Walk through a member: a value, an array or a sequence."""
         if member.count is None:
-            self._value(member.type, path, depth)
+            self._walk_value(member.type, path, depth)
             return
-        count = member.count or self._length()
+        count = member.count or self._read_length()
         if member.type in PRIMITIVES:
             if count:
-                self._numbers(member.type, path, count)
+                self._note_numbers(member.type, path, count)
             return
         self.counts[path] = count
         for index in range(count):
-            self._value(member.type, f"{path}[{index}]", depth)
+            self._walk_value(member.type, f"{path}[{index}]", depth)
 
-    def _value(self, kind: str, path: str, depth: int) -> None:
+    def _walk_value(self, kind: str, path: str, depth: int) -> None:
+        """Walk through one value of a kind."""
         if kind in PRIMITIVES:
-            self._numbers(kind, path, None)
+            self._note_numbers(kind, path, None)
         elif kind == "string":
-            self._text(path)
+            self._note_text(path)
         elif kind == "wstring":
             raise UndecodableError("wide text is not read")
         else:
-            self._message(kind, path, depth + 1)
+            self._walk_message(kind, path, depth + 1)
 
-    def _numbers(self, kind: str, path: str, count: int | None) -> None:
+    def _note_numbers(self, kind: str, path: str, count: int | None) -> None:
+        """Note where a number, or so many of them, lie."""
         size = int(PRIMITIVES[kind][1])
-        offset = self._take(size * (1 if count is None else count), size)
+        offset = self._take_bytes(size * (1 if count is None else count), size)
         self.places[path] = FieldPlace(kind, offset, count)
 
-    def _text(self, path: str) -> None:
+    def _note_text(self, path: str) -> None:
         """A text with its closing zero, which programs leave out where there is no text."""
-        length = self._length()
-        offset = self._take(length, 1)
+        length = self._read_length()
+        offset = self._take_bytes(length, 1)
         if length and self._payload[self._at - 1]:
             raise UndecodableError("a text has no closing zero")
         self.places[path] = FieldPlace("string", offset, length)
 
-    def _length(self) -> int:
-        offset = self._take(4, 4)
+    def _read_length(self) -> int:
+        """The length that stands here."""
+        offset = self._take_bytes(4, 4)
         self.lengths.append(offset)
         return int.from_bytes(self._payload[offset : self._at], "little" if self.little else "big")
 
-    def _take(self, size: int, alignment: int) -> int:
+    def _take_bytes(self, size: int, alignment: int) -> int:
+        """Where the next bytes of a size lie, aligned."""
         start = self._at + -(self._at - HEADER_SIZE) % alignment
         if start + size > len(self._payload):
             raise UndecodableError("the message ends too early")
@@ -200,7 +207,8 @@ def layout_of_cdr(
     walk = RosWalk(payload, *definition)
     elements = [f"{rows}[{index}]." for index in range(walk.counts.get(rows, 0))] if rows else [""]
     fields = {
-        path: [_field(walk, f"{element}{path}", path, dtype) for element in elements] for path, dtype in types.items()
+        path: [_field_of_path(walk, f"{element}{path}", path, dtype) for element in elements]
+        for path, dtype in types.items()
     }
     static = bytearray(len(payload))
     static[0:2] = b"\xff\xff"
@@ -212,7 +220,7 @@ def layout_of_cdr(
     return layout_of(payload, static, fields)
 
 
-def _field(walk: RosWalk, path: str, outside: str, dtype: pl.DataType) -> Field:
+def _field_of_path(walk: RosWalk, path: str, outside: str, dtype: pl.DataType) -> Field:
     """The field of this path in an element or, by the path `outside` of it, in the message."""
     place = walk.places.get(path) or walk.places.get(outside)
     if place is not None and (place.size is None or place.kind == "string"):
@@ -227,6 +235,7 @@ def _field(walk: RosWalk, path: str, outside: str, dtype: pl.DataType) -> Field:
 
 
 def _field_at(place: FieldPlace, index: int, little: bool) -> Field:
+    """How the field at a place is read; `index`: which element of an array."""
     if place.kind == "string":
         return text(place.offset, place.size - 1) if place.size else constant("", pl.String())
     code = PRIMITIVES[place.kind]

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from pipeline.read.ingest.conform import refuse_too_many
-from pipeline.read.ingest.correct import corrected
+from pipeline.read.ingest.correct import correct_run
 from pipeline.read.ingest.mcap_run import MOST_TOPICS, BlockSink, read_mcap, read_mcaps
 from pipeline.read.ingest.parquet import read_folder
 from pipeline.storage import files
@@ -38,7 +38,7 @@ def read_run(path: Address, config: IngestConfig = _DEFAULTS, with_digest: bool 
     Source:
         CONTRACT section 1.
     """
-    return corrected(_limited(_recorded(path, config, with_digest), path, config), config.correct)
+    return correct_run(_require_limits(_read_recorded(path, config, with_digest), path, config), config.correct)
 
 
 def read_part(
@@ -46,10 +46,10 @@ def read_part(
 ) -> RunLog:
     """As `read_run` of the MCAP files of one log, which may be one of several of a run (`read_mcaps`)."""
     run = read_mcaps(paths, config, partly=partly, beside=beside)
-    return corrected(_limited(run, paths[0], config), config.correct, later=partly)
+    return correct_run(_require_limits(run, paths[0], config), config.correct, later=partly)
 
 
-def _limited(run: RunLog, path: Address, config: IngestConfig) -> RunLog:
+def _require_limits(run: RunLog, path: Address, config: IngestConfig) -> RunLog:
     """The same run; raises `InputError` where it has more rows or solutions than any journey."""
     for stream in STREAMS:
         if (frame := run.stream(stream)) is not None:
@@ -66,7 +66,8 @@ def _limited(run: RunLog, path: Address, config: IngestConfig) -> RunLog:
     return run
 
 
-def _recorded(path: Address, config: IngestConfig, with_digest: bool) -> RunLog:
+def _read_recorded(path: Address, config: IngestConfig, with_digest: bool) -> RunLog:
+    """The run as it is stored, whatever the form."""
     if name_of(path).endswith(".mcap"):
         return read_mcap(path, config, with_digest)
     if files.is_dir(path):

@@ -49,28 +49,29 @@ class TimeSource:
 
         Raises ValueError where the nanoseconds of a stamp make a second or more: it contradicts itself.
         """
-        counted = self._nanoseconds(frame).alias(name)
+        counted = self._parse_nanoseconds(frame).alias(name)
         epoch_ns = _EPOCHS_NS[self.epoch]
         return utc_of(counted + epoch_ns if epoch_ns else counted, self.scale)
 
-    def _nanoseconds(self, frame: pl.DataFrame) -> pl.Series:
+    def _parse_nanoseconds(self, frame: pl.DataFrame) -> pl.Series:
+        """Nanoseconds since 1970, or of the stamp's own epoch."""
         first = frame[self.fields[0]]
         if len(self.fields) == 2:
             rest = frame[self.fields[1]]
             if not _all_between(rest, 0, NS_PER_S - 1):
                 row = int((~rest.is_between(0, NS_PER_S - 1).fill_null(True)).arg_max() or 0)
                 raise ValueError(f"{rest[row]} nanoseconds beside whole seconds in message {row} of the topic")
-            return within(first, NS_PER_S) * NS_PER_S + rest
+            return counts_within(first, NS_PER_S) * NS_PER_S + rest
         dtype = self.types.get(self.fields[0], pl.Int64())
         if dtype == pl.String:
             # Beyond 64 bits polars goes round without a word, so the date is read in microseconds before.
             date = first.str.to_datetime("%+", time_unit="us", time_zone="UTC", strict=True).to_physical()
             t = first.str.to_datetime("%+", time_unit="ns", time_zone="UTC", strict=True).to_physical()
-            return t.set(within(date, 1000).is_null(), None)
+            return t.set(counts_within(date, 1000).is_null(), None)
         if dtype == pl.Int64:
             unit_ns = 1 if self.unit_s is None else round(self.unit_s * 1e9)
-            return within(first, unit_ns) * unit_ns
-        return within((first * ((1.0 if self.unit_s is None else self.unit_s) * 1e9)).round(), 1).cast(pl.Int64)
+            return counts_within(first, unit_ns) * unit_ns
+        return counts_within((first * ((1.0 if self.unit_s is None else self.unit_s) * 1e9)).round(), 1).cast(pl.Int64)
 
 
 def utc_of(t_ns: pl.Series, scale: str) -> pl.Series:
@@ -84,7 +85,7 @@ def utc_of(t_ns: pl.Series, scale: str) -> pl.Series:
 def gps_ns_of_weeks(week: pl.Series, tow_s: pl.Series) -> pl.Series:
     """Nanoseconds since 1970 on the GPS scale of weeks and seconds in them, to microseconds; null beyond both."""
     in_week_us = (tow_s.set(~tow_s.is_between(0.0, WEEK_NS / NS_PER_S), None) * 1e6).round()
-    return GPS_EPOCH_NS + within(week, WEEK_NS) * WEEK_NS + in_week_us.cast(pl.Int64) * 1000
+    return GPS_EPOCH_NS + counts_within(week, WEEK_NS) * WEEK_NS + in_week_us.cast(pl.Int64) * 1000
 
 
 def orders_of_day(first: pl.Series, second: pl.Series) -> list[str]:
@@ -98,7 +99,7 @@ def day_is_unclear(first: pl.Series, second: pl.Series) -> bool:
     return len(orders_of_day(first, second)) > 1 and bool((first != second).any())
 
 
-def within(counts: pl.Series, unit_ns: int) -> pl.Series:
+def counts_within(counts: pl.Series, unit_ns: int) -> pl.Series:
     """The counts of a unit since an epoch, null before it and after `LATEST_NS`: nothing then overflows 64 bits."""
     most = LATEST_NS // max(unit_ns, 1)
     return counts if _all_between(counts, 0, most) else counts.set(~counts.is_between(0, most), None)

@@ -46,8 +46,8 @@ def wrap_of(values: Floats, t_ns: Ints | None = None, config: WrapsConfig = _USU
     steps = np.diff(recorded)
     if steps.size < _AROUND or not np.any(np.abs(steps) > 0.5 * np.ptp(recorded)):
         return None
-    paused = np.zeros(steps.size, dtype=np.bool_) if t_ns is None else _paused(t_ns[known], config)
-    tried = (_wrap_by(count, recorded, paused, config) for count in _counts_of(recorded))
+    paused = np.zeros(steps.size, dtype=np.bool_) if t_ns is None else _are_pauses(t_ns[known], config)
+    tried = (_wrap_by_count(count, recorded, paused, config) for count in _counts_of(recorded))
     found = [wrap for wrap in tried if wrap is not None]
     return next((wrap for wrap in found if wrap.certain), found[0] if found else None)
 
@@ -58,11 +58,11 @@ def _counts_of(recorded: Floats) -> list[float]:
     return fitting[: 1 if 1.0 in fitting else _TRIED]
 
 
-def _wrap_by(count: float, recorded: Floats, paused: Bools, config: WrapsConfig) -> Wrap | None:
+def _wrap_by_count(count: float, recorded: Floats, paused: Bools, config: WrapsConfig) -> Wrap | None:
     """As `wrap_of`, where one count is so much of the recorded unit."""
     counts = recorded / count
     moves = np.diff(counts)
-    usual = _usual(moves)
+    usual = _usual_moves(moves)
     for size in _SIZES:
         over = np.abs(moves) >= config.named_share * size
         in_range = np.ptp(counts) < size and counts.min() >= -size // 2
@@ -77,24 +77,26 @@ def _wrap_by(count: float, recorded: Floats, paused: Bools, config: WrapsConfig)
 
 
 def _are_whole(counts: Floats) -> bool:
+    """Whether all counts are whole numbers, but for rounding."""
     return counts.size > 0 and bool(
         np.all(np.abs(counts - np.round(counts)) <= _WHOLE * np.maximum(np.abs(counts), 1.0))
     )
 
 
-def _usual(moves: Floats) -> Floats:
+def _usual_moves(moves: Floats) -> Floats:
     """The largest step near each, itself and those over the end left out."""
     near = np.where(np.abs(moves) > 0.5 * np.abs(moves).max(), 0.0, np.abs(moves))
     padded = np.pad(near, _AROUND)
     return np.asarray(np.lib.stride_tricks.sliding_window_view(padded, 2 * _AROUND + 1).max(axis=1))
 
 
-def _paused(t_ns: Ints, config: WrapsConfig) -> Bools:
+def _are_pauses(t_ns: Ints, config: WrapsConfig) -> Bools:
+    """Steps of time that are much longer than usual."""
     steps_ns = np.diff(t_ns)
     return np.asarray(steps_ns > config.pause_steps * np.median(steps_ns))
 
 
-def counted_on(values: Floats, size: float) -> Floats:
+def unwrap(values: Floats, size: float) -> Floats:
     """The values of a counter that begins anew after `size`, each step the shorter way round; NaN stays."""
     known = np.flatnonzero(np.isfinite(values))
     recorded = values[known]
@@ -117,10 +119,10 @@ def with_whole_counts(
     """A recorded counter over its ends: as `declared`, else where it is certain. `sensors`: by row."""
     values = column.cast(pl.Float64).fill_null(float("nan")).to_numpy().copy()
     found: list[Wrap] = []
-    for rows in _rows_of(sensors, values.size):
+    for rows in _rows_by_sensor(sensors, values.size):
         wrap = wrap_of(values[rows], None if t_ns is None else t_ns[rows], config) if declared is None else None
         if declared is not None or (wrap is not None and wrap.certain):
-            whole = counted_on(values[rows], declared or (wrap.size if wrap else 1.0))
+            whole = unwrap(values[rows], declared or (wrap.size if wrap else 1.0))
             turned = int(np.sum(np.abs(np.diff(whole - values[rows])) > 0.0))
             found += [Wrap(declared, turned, certain=True)] if declared and turned else []
             values[rows] = whole
@@ -128,7 +130,8 @@ def with_whole_counts(
     return UnwrappedColumn(pl.Series(column.name, values).fill_nan(None), found)
 
 
-def _rows_of(sensors: pl.Series | None, size: int) -> Iterable[Ints]:
+def _rows_by_sensor(sensors: pl.Series | None, size: int) -> Iterable[Ints]:
+    """Rows of each sensor; all rows without sensors."""
     if sensors is None:
         return [np.arange(size)]
     return [np.flatnonzero((sensors == name).to_numpy()) for name in sensors.drop_nulls().unique(maintain_order=True)]
@@ -149,11 +152,11 @@ def whole_stream(odometer: pl.DataFrame, config: IngestConfig) -> tuple[pl.DataF
         return odometer, []
     t_ns = times_ns(odometer)
     whole, found = with_whole_counts(odometer["distance_m"], t_ns, None, odometer["sensor"], config.wraps)
-    said = [f"{times} x {text}" for text, times in said_of_wraps(found, whole.name, _IN_RUN).items()]
+    said = [f"{times} x {text}" for text, times in wrap_remarks(found, whole.name, _IN_RUN).items()]
     return odometer.with_columns(whole) if any(wrap.certain for wrap in found) else odometer, said
 
 
-def said_of_wraps(found: Iterable[Wrap], column: str, how: str = _IN_MAPPING) -> dict[str, int]:
+def wrap_remarks(found: Iterable[Wrap], column: str, how: str = _IN_MAPPING) -> dict[str, int]:
     """For people: what was found of a counter, and how often; `how` the line is written that counts on."""
     certain = f"(put right; {how} says so)"
     unsure = f"(kept: it may have been reset; {how} counts on)"

@@ -65,17 +65,17 @@ def window_findings(site: Site, config: LdsConfig = DEFAULTS, limits: SiteConfig
     network = network_of(surveyed_track(site), site.links)
     findings: dict[tuple[str, str], Finding] = {}
     for (_,), balises in site.balises.filter("linked").group_by("kind", maintain_order=True):
-        points = _points(balises, network)
+        points = _balises_by_element(balises, network)
         for oriented, on_it in sorted(points.items()):
             for index, reference in enumerate(on_it):
-                for near, far in _ahead(network, points, oriented, index, limits.announced_m):
-                    if finding := _judge(reference, near, far, config):
+                for near, far in _next_balises(network, points, oriented, index, limits.announced_m):
+                    if finding := _overlap_finding(reference, near, far, config):
                         first, second = sorted((near[0].balise_id, far[0].balise_id))
                         findings.setdefault((first, second), finding)
     return [findings[pair] for pair in sorted(findings)]
 
 
-def _points(balises: pl.DataFrame, network: Network) -> dict[int, list[_Point]]:
+def _balises_by_element(balises: pl.DataFrame, network: Network) -> dict[int, list[_Point]]:
     """Balises of one kind by oriented element, in the order in which a train meets them."""
     points: dict[int, list[_Point]] = {}
     columns = ("balise_id", "netelement_id", "measure_m", "location_accuracy_m")
@@ -96,13 +96,14 @@ _OnChain = tuple[_Point, float]
 """A balise with its distance from the reference [m]."""
 
 
-def _ahead(
+def _next_balises(
     network: Network, points: dict[int, list[_Point]], oriented: int, index: int, announced_m: float
 ) -> Iterator[tuple[_OnChain, _OnChain]]:
     """The next two balises on each way ahead of one, as far as it is announced."""
     reference = points[oriented][index]
 
-    def on_chain(chain: Chain) -> tuple[_OnChain, ...]:
+    def balises_on_chain(chain: Chain) -> tuple[_OnChain, ...]:
+        """The first two balises on a chain beyond the one asked for."""
         entered = zip(chain.oriented, chain.entry_m, strict=True)
         ahead = (
             (point, entry_m + point.at_m)
@@ -112,18 +113,22 @@ def _ahead(
         return tuple(islice(ahead, 2))
 
     def onward(chain: Chain) -> list[Edge]:
-        return [edge for edge in network.successors[chain.oriented[-1]] if edge.forward and len(on_chain(chain)) < 2]
+        """Relations that lead on, until two balises are met."""
+        return [
+            edge for edge in network.successors[chain.oriented[-1]] if edge.forward and len(balises_on_chain(chain)) < 2
+        ]
 
-    def same(chain: Chain) -> tuple[int, tuple[str, ...]]:
-        return chain.oriented[-1], tuple(point.balise_id for point, _ in on_chain(chain))
+    def chain_key(chain: Chain) -> tuple[int, tuple[str, ...]]:
+        """What makes two chains the chain_key: their last element and their balises."""
+        return chain.oriented[-1], tuple(point.balise_id for point, _ in balises_on_chain(chain))
 
     begin = Chain((oriented,), (-reference.at_m,))
-    for found in search_chains(network, begin, announced_m, onward, same):
-        if len(pair := on_chain(found.chain)) == 2:
+    for found in search_chains(network, begin, announced_m, onward, chain_key):
+        if len(pair := balises_on_chain(found.chain)) == 2:
             yield pair[0], pair[1]
 
 
-def _judge(reference: _Point, near: _OnChain, far: _OnChain, config: LdsConfig) -> Finding | None:
+def _overlap_finding(reference: _Point, near: _OnChain, far: _OnChain, config: LdsConfig) -> Finding | None:
     """A warning if the expectation windows of two balises on a chain overlap."""
     (expected, distance_m) = near
     (later, later_m) = far
@@ -162,8 +167,8 @@ def parallel_findings(site: Site, config: Configuration = _WHOLE) -> list[Findin
         return []
     network = network_of(surveyed_track(site), site.links)
     return [
-        _finding(site, network, stretch, config.matching)
-        for stretch in _stretches(network, config.matching)
+        _parallel_finding(site, network, stretch, config.matching)
+        for stretch in _parallel_stretches(network, config.matching)
         if stretch.end_m - stretch.begin_m >= config.site.parallel_least_m
     ]
 
@@ -178,7 +183,7 @@ class TrackResolution(NamedTuple):
 
 def track_resolution(track: SurveyedTrack, config: MatchingConfig) -> TrackResolution:
     """Distance between tracks that a lasting offset, and that a switch taken can resolve [m]."""
-    survey_m = _survey_m(track, config)
+    survey_m = _survey_sigmas_m(track, config)
     return TrackResolution(
         survey_m,
         offset_resolution_m(survey_m, config.paths_alpha, config.cross_bias_sigma_m),
@@ -219,7 +224,7 @@ def neighbouring_tracks(network: Network, limit_m: Floats, config: MatchingConfi
     return NeighbourPairs(pairs[order], row, along.measure_m[row], near_track.distance_m[near][order])
 
 
-def _stretches(network: Network, config: MatchingConfig) -> Iterator[_ParallelStretch]:
+def _parallel_stretches(network: Network, config: MatchingConfig) -> Iterator[_ParallelStretch]:
     """Parts of the first of each pair of elements that lie too near the second."""
     resolution = track_resolution(network.track, config)
     for part in neighbouring_tracks(network, np.fmax(resolution.by_offset_m, resolution.by_switch_m), config).parts():
@@ -228,10 +233,11 @@ def _stretches(network: Network, config: MatchingConfig) -> Iterator[_ParallelSt
         yield _ParallelStretch(one, other, *ends_m, float(np.median(part.apart_m)))
 
 
-def _finding(site: Site, network: Network, stretch: _ParallelStretch, config: MatchingConfig) -> Finding:
+def _parallel_finding(site: Site, network: Network, stretch: _ParallelStretch, config: MatchingConfig) -> Finding:
+    """The warning on a stretch of parallel track, with what would tell the tracks apart."""
     name = network.track.ids[stretch.element]
     parallel = network.track.ids[stretch.other]
-    survey_m = _survey_m(network.track, config)[stretch.element]
+    survey_m = _survey_sigmas_m(network.track, config)[stretch.element]
     needed_m = float(switch_resolution_m(survey_m, config.paths_alpha, config.paths_alike_m))
     by_a_switch = (
         f"a switch taken tells them apart at a survey of {survey_m:.2g} m"
@@ -242,10 +248,10 @@ def _finding(site: Site, network: Network, stretch: _ParallelStretch, config: Ma
         f"{stretch.begin_m:.0f} to {stretch.end_m:.0f} m: {parallel} lies {stretch.apart_m:.1f} m beside it; offsets "
         f"alone do not tell them apart, so that virtual balises there are ambiguous; {by_a_switch}"
     )
-    return Finding("warning", f"element {name}", text, _remedy(site, network, stretch))
+    return Finding("warning", f"element {name}", text, _remedy_words(site, network, stretch))
 
 
-def _remedy(site: Site, network: Network, stretch: _ParallelStretch) -> str:
+def _remedy_words(site: Site, network: Network, stretch: _ParallelStretch) -> str:
     """What would tell: a route always, reads and switches where there are some."""
     means = ["a route (`balise replay --write-route`, `--route`)"]
     names = [network.track.ids[stretch.element], network.track.ids[stretch.other]]
@@ -259,7 +265,7 @@ def _remedy(site: Site, network: Network, stretch: _ParallelStretch) -> str:
     return f"To tell the two apart: {', '.join(means)}."
 
 
-def _survey_m(track: SurveyedTrack, config: MatchingConfig) -> Floats:
+def _survey_sigmas_m(track: SurveyedTrack, config: MatchingConfig) -> Floats:
     """Survey sigma of each element, the least of its points [m]; the configured one where it states none."""
     stated = np.where(np.isfinite(track.sigma_m), track.sigma_m, config.survey_sigma_default_m)
     return np.asarray(np.minimum.reduceat(stated, track.first[:-1]))

@@ -25,7 +25,7 @@ from schemas.run import BALISE_PLACE, Finding
 
 
 @dataclass
-class Remarks:
+class SiteRemarks:
     """Findings, fatal breaches, and the links without those to nowhere; what is either is configuration."""
 
     links: pl.DataFrame
@@ -34,24 +34,24 @@ class Remarks:
     breaches: list[str] = field(default_factory=list)
 
 
-def remarks(
+def check_site(
     track: SurveyedTrack,
     links: pl.DataFrame,
     balises: pl.DataFrame | None,
     route: pl.DataFrame | None,
     declared_length_m: dict[str, float],
     config: SiteConfig,
-) -> Remarks:
+) -> SiteRemarks:
     """All checks over the tables of a site."""
     known, findings = relations_to_nowhere(track, links)
     related = _related_ends(track, known)
-    inward = outward(track).reshape(-1, 3)
+    inward = directions_inward(track).reshape(-1, 3)
     passable, turning = _relations_that_turn_back(known, related, inward)
-    collected = Remarks(passable, config, [*findings, *_relations_that_differ(known, related), *turning])
+    collected = SiteRemarks(passable, config, [*findings, *_relations_that_differ(known, related), *turning])
     _check_elements(track, declared_length_m, collected)
     _check_kinks(track, known, related, inward, collected)
     _check_gaps(track, related, collected)
-    collected.findings += _near_misses(track, related, inward, config)
+    collected.findings += _near_miss_findings(track, related, inward, config)
     if balises is not None:
         _check_balises(track, balises, collected)
     if route is not None:
@@ -171,7 +171,7 @@ def _relations_that_turn_back(
     return links.with_columns(navigability=closed.otherwise("navigability")), findings
 
 
-def outward(track: SurveyedTrack) -> np.ndarray:
+def directions_inward(track: SurveyedTrack) -> np.ndarray:
     """Direction from each end into its element, earth-centred and not normed: `[element, 0 start or 1 end]`."""
     surface = track.surface
     start = track.first[:-1]
@@ -195,7 +195,7 @@ def outward(track: SurveyedTrack) -> np.ndarray:
     return directions
 
 
-def _check_elements(track: SurveyedTrack, declared_length_m: dict[str, float], collected: Remarks) -> None:
+def _check_elements(track: SurveyedTrack, declared_length_m: dict[str, float], collected: SiteRemarks) -> None:
     """Length, declared length, height and vertex spacing of each element."""
     geometric = track.geometric_m
     length_m = geometric[track.first[1:] - 1]
@@ -222,7 +222,7 @@ def _check_elements(track: SurveyedTrack, declared_length_m: dict[str, float], c
 
 
 def _check_kinks(
-    track: SurveyedTrack, links: pl.DataFrame, related: tuple[Ints, Ints], inward: Floats, collected: Remarks
+    track: SurveyedTrack, links: pl.DataFrame, related: tuple[Ints, Ints], inward: Floats, collected: SiteRemarks
 ) -> None:
     """Corners at the ends of elements that are shorter than tracks are surveyed, where a train may pass."""
     length_m = track.geometric_m[track.first[1:] - 1]
@@ -239,7 +239,7 @@ def _check_kinks(
         collected.findings.append(Finding("warning", f"track: element {a}", text, remedy))
 
 
-def _check_heights(track: SurveyedTrack, collected: Remarks) -> None:
+def _check_heights(track: SurveyedTrack, collected: SiteRemarks) -> None:
     """Refuse sites of which only some net elements have heights."""
     # An element has all heights or none.
     flat = [track.ids[element] for element in np.flatnonzero(np.isnan(track.height_m[track.first[:-1]])).tolist()]
@@ -273,7 +273,7 @@ def chord_errors_m(track: SurveyedTrack) -> Floats:
     return np.asarray(errors)
 
 
-def _check_gaps(track: SurveyedTrack, related: tuple[Ints, Ints], collected: Remarks) -> None:
+def _check_gaps(track: SurveyedTrack, related: tuple[Ints, Ints], collected: SiteRemarks) -> None:
     """Ends that a relation joins must meet, in place and, where both have one, in height."""
     end_a, end_b = related
     places = end_places(track).reshape(-1, 3)
@@ -294,7 +294,7 @@ def _check_gaps(track: SurveyedTrack, related: tuple[Ints, Ints], collected: Rem
             collected.findings.append(Finding("warning", "links", text, "Correct the heights."))
 
 
-def _near_misses(
+def _near_miss_findings(
     track: SurveyedTrack, related: tuple[Ints, Ints], inward: Floats, config: SiteConfig
 ) -> Iterator[Finding]:
     """Free ends from which a train could go on: to a near end of another element, or to one that faces it."""
@@ -359,7 +359,7 @@ def _close_ends(places: Floats, inward: Floats, free: np.ndarray, config: SiteCo
     return [(first, second, float(np.linalg.norm(places[first] - places[second]))) for first, second in pairs]
 
 
-def _check_balises(track: SurveyedTrack, balises: pl.DataFrame, collected: Remarks) -> None:
+def _check_balises(track: SurveyedTrack, balises: pl.DataFrame, collected: SiteRemarks) -> None:
     """Refuse balises that a site cannot have."""
     repeated = balises.filter(pl.col("balise_id").is_duplicated())["balise_id"].unique().sort().to_list()
     if repeated:
@@ -367,14 +367,14 @@ def _check_balises(track: SurveyedTrack, balises: pl.DataFrame, collected: Remar
     off = [
         Finding("error", f"{BALISE_PLACE}{name}", *what)
         for name, element, measure in balises.select("balise_id", "netelement_id", "measure_m").iter_rows()
-        if (what := _off_the_track(track, element, measure)) is not None
+        if (what := _why_off_track(track, element, measure)) is not None
     ]
     collected.findings += off
     if off and len(off) == balises.height:
         collected.breaches.append(f"balises: none lies on a net element of the track; {off[0].place} {off[0].message}")
 
 
-def _off_the_track(track: SurveyedTrack, element: str, measure_m: float) -> tuple[str, str] | None:
+def _why_off_track(track: SurveyedTrack, element: str, measure_m: float) -> tuple[str, str] | None:
     """Why no run will pass a balise, and what to mend."""
     if element not in track.index:
         return f"lies on element {element}, which is not in the track: no run will pass it", "Correct netelement_id."

@@ -29,7 +29,7 @@ def describe_site(site: Site) -> dict[str, object]:
         "length_m": float(track.length_m.sum()),
         "longest_m": float(track.length_m.max()),
         "shortest_m": float(track.length_m.min()),
-        "dimensions": _dimensions(track),
+        "dimensions": _dimensions_word(track),
         "spacing_median_m": float(np.median(spacing)),
         "spacing_max_m": float(spacing.max()),
         "sigma_median_m": float(np.median(known)) if len(known) else None,
@@ -49,7 +49,7 @@ def describe_site(site: Site) -> dict[str, object]:
     }
 
 
-def without_balises(balises: pl.DataFrame | None) -> tuple[Finding, ...]:
+def no_balises_finding(balises: pl.DataFrame | None) -> tuple[Finding, ...]:
     """A finding where a site has no balises, because then nothing is judged but positions."""
     if balises is not None and balises.height:
         return ()
@@ -81,7 +81,7 @@ def elements_table(site: Site) -> pl.DataFrame:
     return pl.DataFrame(rows, schema=list(columns), orient="row")
 
 
-def _dimensions(track: SurveyedTrack) -> str:
+def _dimensions_word(track: SurveyedTrack) -> str:
     """Whether a site has heights, for people."""
     flat = [bool(np.isnan(track.height_m[part]).any()) for _, _, part in track.elements()]
     if all(flat):

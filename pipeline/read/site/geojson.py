@@ -69,23 +69,23 @@ def read_network(file: str, data: bytes, breaches: list[str]) -> GeoJsonNetwork 
     try:
         document = json.loads(data)
         features = list(document["features"])
-        epsg = _epsg(document)
+        epsg = _epsg_of(document)
     except _MALFORMED as error:
         breaches.append(f"{file}: is not a GeoJSON FeatureCollection ({error})")
         return None
-    network = _network(file, features, epsg, breaches)
+    network = _network_of_features(file, features, epsg, breaches)
     network.latitude_first = latitude_first(document)
     return network
 
 
 def latitude_first(document: Mapping[str, Any]) -> bool:
-    """It names WGS 84 by an address of EPSG, which has the latitude first; GeoJSON has the longitude first."""
+    """Whether a document names WGS 84 by an address of EPSG, with the latitude first; GeoJSON has longitude first."""
     return bool(re.search(r"urn:.*EPSG.*4326|/EPSG/.*4326", json.dumps(document.get("crs")), re.IGNORECASE))
 
 
 def has_relations(features: Iterable[Any]) -> bool:
     """Whether net relations come with the lines: a network that says where trains can run. Raises `ValueError`."""
-    return any(_is_relation(_plain_keys(None, parts_of(feature)[0])) for feature in features)
+    return any(_is_relation(_normalised_keys(None, properties_and_geometry(feature)[0])) for feature in features)
 
 
 def _is_relation(keys: Mapping[str, Any]) -> bool:
@@ -93,7 +93,7 @@ def _is_relation(keys: Mapping[str, Any]) -> bool:
     return any(key in keys for key in (*_A_KEYS, *_B_KEYS))
 
 
-def _network(file: str, features: list[Any], epsg: int, breaches: list[str]) -> GeoJsonNetwork:
+def _network_of_features(file: str, features: list[Any], epsg: int, breaches: list[str]) -> GeoJsonNetwork:
     """Net elements and links of features."""
     points: list[tuple[Any, ...]] = []
     relations: list[tuple[Any, ...]] = []
@@ -101,12 +101,12 @@ def _network(file: str, features: list[Any], epsg: int, breaches: list[str]) -> 
     ignored = 0
     for number, feature in enumerate(features):
         try:
-            properties, geometry = parts_of(feature)
-            keys = _plain_keys(feature.get("id"), properties)
+            properties, geometry = properties_and_geometry(feature)
+            keys = _normalised_keys(feature.get("id"), properties)
             if _is_relation(keys):
-                relations.append(_relation(keys))
+                relations.append(_relation_row(keys))
             elif geometry.get("type") in ("LineString", "MultiLineString"):
-                points += _element(geometry, keys, lengths)
+                points += _element_points(geometry, keys, lengths)
             else:
                 ignored += 1
         except _MALFORMED as error:
@@ -116,7 +116,7 @@ def _network(file: str, features: list[Any], epsg: int, breaches: list[str]) -> 
     return GeoJsonNetwork(track, links, lengths, ignored)
 
 
-def parts_of(feature: Any) -> tuple[Mapping[str, Any], Mapping[str, Any]]:
+def properties_and_geometry(feature: Any) -> tuple[Mapping[str, Any], Mapping[str, Any]]:
     """Properties and geometry of a feature, empty where it has none. Raises `ValueError`."""
     names = ("properties", "geometry")
     members = [(feature.get(name) or {}) if isinstance(feature, Mapping) else None for name in names]
@@ -125,7 +125,7 @@ def parts_of(feature: Any) -> tuple[Mapping[str, Any], Mapping[str, Any]]:
     return members[0], members[1]  # type: ignore[return-value]
 
 
-def triple(point: Any) -> tuple[float, float, float | None]:
+def coordinates_of(point: Any) -> tuple[float, float, float | None]:
     """Longitude, latitude and height (none where there is none). Raises `ValueError`."""
     try:
         longitude, latitude, *height = point
@@ -142,20 +142,22 @@ def number_of(value: Any) -> float:
     return float(value)
 
 
-def _plain_keys(own_id: Any, properties: Mapping[str, Any]) -> dict[str, Any]:
+def _normalised_keys(own_id: Any, properties: Mapping[str, Any]) -> dict[str, Any]:
     """Properties by lower-case name without underscores; the feature's own `id` where they have none."""
     keys = {re.sub(r"^\w+:|[_\-\s]", "", str(key)).lower(): value for key, value in properties.items()}
     return keys if own_id is None else {"id": own_id, **keys}
 
 
-def _first(keys: Mapping[str, Any], names: tuple[str, ...]) -> Any:
+def _first_value(keys: Mapping[str, Any], names: tuple[str, ...]) -> Any:
     """The first of several keys that a feature has."""
     return next((keys[name] for name in names if keys.get(name) is not None), None)
 
 
-def _element(geometry: Mapping[str, Any], keys: Mapping[str, Any], lengths: dict[str, float]) -> list[tuple[Any, ...]]:
+def _element_points(
+    geometry: Mapping[str, Any], keys: Mapping[str, Any], lengths: dict[str, float]
+) -> list[tuple[Any, ...]]:
     """The points of a net element; its declared length goes into `lengths`, NaN where it states none."""
-    name = _first(keys, _ID_KEYS)
+    name = _first_value(keys, _ID_KEYS)
     if name is None:
         raise ValueError("a LineString without property id or netelement_id")
     if str(name) in lengths:
@@ -167,15 +169,15 @@ def _element(geometry: Mapping[str, Any], keys: Mapping[str, Any], lengths: dict
             raise ValueError(f"{name}: MultiLineString of {len(lines)} parts; a net element is one line")
     if not isinstance(lines[0], list):
         raise ValueError(f"{name}: coordinates are not a list of points")
-    declared = _first(keys, _LENGTH_KEYS)
-    declared_m = _metres(declared) if isinstance(declared, int | float) else None
-    sigma_m = _metres(keys.get("sigmam"))
-    points = [(str(name), *triple(point), sigma_m) for point in lines[0]]
+    declared = _first_value(keys, _LENGTH_KEYS)
+    declared_m = _metres_or_none(declared) if isinstance(declared, int | float) else None
+    sigma_m = _metres_or_none(keys.get("sigmam"))
+    points = [(str(name), *coordinates_of(point), sigma_m) for point in lines[0]]
     lengths[str(name)] = float("nan") if declared_m is None else declared_m
     return points
 
 
-def _metres(value: Any) -> float | None:
+def _metres_or_none(value: Any) -> float | None:
     """A number of metres, if it is one."""
     if value is None:
         return None
@@ -186,10 +188,10 @@ def _metres(value: Any) -> float | None:
     return float(value)
 
 
-def _relation(keys: Mapping[str, Any]) -> tuple[Any, ...]:
+def _relation_row(keys: Mapping[str, Any]) -> tuple[Any, ...]:
     """A link of two net elements."""
-    ends = [_referred(_first(keys, names)) for names in (_A_KEYS, _B_KEYS)]
-    positions = [_position(keys, names, origin) for names, origin in (_POSITIONS_A, _POSITIONS_B)]
+    ends = [_referred_id(_first_value(keys, names)) for names in (_A_KEYS, _B_KEYS)]
+    positions = [_end_position(keys, names, origin) for names, origin in (_POSITIONS_A, _POSITIONS_B)]
     # Vocabularies give the word as the last part of an address.
     written = keys.get("navigability")
     word = "" if written is None else re.split("[/#]", str(written).strip().lower())[-1]
@@ -197,16 +199,16 @@ def _relation(keys: Mapping[str, Any]) -> tuple[Any, ...]:
     if word not in known:
         raise ValueError(f"navigability {word or written!r}; expected one of {', '.join(Navigability)}")
     if None in positions:
-        on_a, on_b = (_first(keys, names) for names, _ in (_POSITIONS_A, _POSITIONS_B))
+        on_a, on_b = (_first_value(keys, names) for names, _ in (_POSITIONS_A, _POSITIONS_B))
         raise ValueError(f"positionOnA {on_a!r}, positionOnB {on_b!r}; expected 0 or 1 (start or end)")
     if None in ends:
         raise ValueError(f"netelementA {ends[0]!r}, netelementB {ends[1]!r}; a relation joins two elements")
     return str(ends[0]), positions[0], str(ends[1]), positions[1], known[word]
 
 
-def _position(keys: Mapping[str, Any], names: tuple[str, ...], origin: str) -> int | None:
+def _end_position(keys: Mapping[str, Any], names: tuple[str, ...], origin: str) -> int | None:
     """End 0 or 1 of an element, or whether it is its origin (ERA vocabulary); none where neither is said."""
-    written = _first(keys, names)
+    written = _first_value(keys, names)
     at_origin = keys.get(origin)
     if written is None and isinstance(at_origin, bool):
         return 0 if at_origin else 1
@@ -214,14 +216,14 @@ def _position(keys: Mapping[str, Any], names: tuple[str, ...], origin: str) -> i
     return 0 if word in _START else 1 if word in _END else None
 
 
-def _referred(element: Any) -> Any:
+def _referred_id(element: Any) -> Any:
     """The identity of an element that a relation names, itself or by reference."""
     if isinstance(element, Mapping):
-        element = _first(_plain_keys(None, element), ("ref", *_ID_KEYS))
+        element = _first_value(_normalised_keys(None, element), ("ref", *_ID_KEYS))
     return element
 
 
-def _epsg(document: Mapping[str, Any]) -> int:
+def _epsg_of(document: Mapping[str, Any]) -> int:
     """EPSG code of the `crs` member (GeoJSON 2008), WGS 84 without one (RFC 7946)."""
     crs = document.get("crs")
     if crs is None:

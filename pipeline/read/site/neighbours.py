@@ -30,7 +30,7 @@ _NEIGHBOUR_M = 10.0
 _PLACES = 5
 
 
-def neighbours(site: Site, config: Configuration) -> pl.DataFrame:
+def neighbour_table(site: Site, config: Configuration) -> pl.DataFrame:
     """One row per pair of net elements and stretch of at least `parallel_least_m`; measures are those of the first.
 
     With exact positions: a receiver's own sigma comes on top of the survey's. Empty where a route is given.
@@ -44,7 +44,7 @@ def neighbours(site: Site, config: Configuration) -> pl.DataFrame:
     rows = []
     for part in neighbouring_tracks(network, limit_m, config.matching).parts():
         one, other = divmod(int(part.pair[0]), network.count)
-        apart_m = _smoothed(part.apart_m)
+        apart_m = _smooth(part.apart_m)
         offset_m, switch_m = float(resolution.by_offset_m[one]), float(resolution.by_switch_m[one])
         kind = np.where(apart_m >= offset_m, 2, np.where(apart_m >= switch_m, 1, 0))
         for stretch in np.split(np.arange(kind.size), np.flatnonzero(np.diff(kind)) + 1):
@@ -58,7 +58,7 @@ def neighbours(site: Site, config: Configuration) -> pl.DataFrame:
     return pl.DataFrame(rows, schema=_COLUMNS, orient="row")
 
 
-def _smoothed(apart_m: Floats) -> Floats:
+def _smooth(apart_m: Floats) -> Floats:
     """Distances, smoothed by a running median."""
     if apart_m.size < _PLACES:
         return apart_m

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import polars as pl
 
-from pipeline.read.site.checks import drop_repeated_points, drop_scattered_points, remarks
+from pipeline.read.site.checks import check_site, drop_repeated_points, drop_scattered_points
 from pipeline.read.site.geojson import AXES_IN_DOUBT, AXES_REMEDY, GeoJsonNetwork, read_network
 from pipeline.read.site.route import route_table
 from pipeline.read.site.tables import EPSG_WGS84, RawTable, load_table, typed_table
@@ -55,26 +55,26 @@ def read_site(path: Path | str, config: SiteConfig = _DEFAULTS) -> Site:
     Source:
         CONTRACT section 2.
     """
-    files = _files(path)
+    files = _site_files(path)
     breaches: list[str] = []
     survey, network, notes = _read_track(files, config, breaches)
     links = _read_links(files, network, breaches)
-    raw = _load(files, "balises", breaches)
+    raw = _load_file(files, "balises", breaches)
     balises = None if raw is None else typed_table(raw, "balises", breaches)
     name = next((name for name in files if name.startswith("route.")), None)
     route = None if name is None else route_table(name, files[name], breaches)
     route = None if route is None else route.drop("leg")  # that of every run over this site, in one piece
     if breaches or survey is None or links is None:
-        raise _refusal(path, breaches)
+        raise _site_error(path, breaches)
     table, track = survey
     lengths = network.declared_length_m if network else {}
     unchecked = [name for name, data in files.items() if name.endswith(".parquet") and without_checksums(data)]
     notes += [Finding("note", name, "has no page checksums: damage to it may not be seen") for name in unchecked]
     if _is_unrelated(track.ids, links, files):
         notes.append(Finding("warning", "links", _UNRELATED, _MAKE_A_SITE))
-    found = remarks(track, links, balises, route, lengths, config)
+    found = check_site(track, links, balises, route, lengths, config)
     if found.breaches:
-        raise _refusal(path, found.breaches)
+        raise _site_error(path, found.breaches)
     site = Site(
         track=conform(table, Track),
         links=conform(found.links, Links),
@@ -105,7 +105,7 @@ def _is_unrelated(elements: Sequence[str], links: pl.DataFrame, files: Collectio
     return only_lines and links.is_empty() and len(elements) > 1
 
 
-def _files(folder: Path | str) -> dict[str, bytes]:
+def _site_files(folder: Path | str) -> dict[str, bytes]:
     """The site's files by name; of each table there is at most one. A GeoJSON file is a site's only one."""
     names = [table + suffix for table in _NAMES for suffix in _SUFFIXES.get(table, _TABLES)]
     try:
@@ -132,14 +132,14 @@ def _digest(files: dict[str, bytes]) -> str:
     return hashlib.sha256("".join(parts).encode()).hexdigest()
 
 
-def _refusal(path: Path | str, breaches: list[str]) -> SiteError:
+def _site_error(path: Path | str, breaches: list[str]) -> SiteError:
     """The error for a site with all that is wrong with it."""
     remedy = "Correct what is named; `balise dictionary` lists the columns of a site."
     remedy = f"Correct what is named. {_MAKE_A_SITE}" if is_geojson(path) else remedy
     return SiteError(listed(breaches), place=shown(path), remedy=remedy)
 
 
-def _load(files: dict[str, bytes], table: str, breaches: list[str]) -> RawTable | None:
+def _load_file(files: dict[str, bytes], table: str, breaches: list[str]) -> RawTable | None:
     """A table of a site, if there is a file of it."""
     name = next((name for name in files if name.startswith(f"{table}.")), None)
     return None if name is None else load_table(name, files[name], breaches)
@@ -154,7 +154,7 @@ def _read_track(
         network = read_network("track.geojson", files["track.geojson"], breaches)
         raw = network.track if network else None
     else:
-        raw = _load(files, "track", breaches)
+        raw = _load_file(files, "track", breaches)
     frame = typed_table(_named_by_contract(raw), "track", breaches) if raw is not None else None
     if raw is None or frame is None:
         return None, network, []
@@ -175,7 +175,7 @@ def _read_track(
 
 def _read_links(files: dict[str, bytes], network: GeoJsonNetwork | None, breaches: list[str]) -> pl.DataFrame | None:
     """Links from their own table, else from the GeoJSON; a site of one element needs none."""
-    raw = _load(files, "links", breaches)
+    raw = _load_file(files, "links", breaches)
     if raw is None and network is not None:
         raw = network.links
     if raw is None:
@@ -195,7 +195,7 @@ def _named_by_contract(raw: RawTable) -> RawTable:
 def to_wgs84(raw: RawTable, frame: pl.DataFrame, config: SiteConfig, breaches: list[str]) -> pl.DataFrame:
     """Positions in WGS 84, checked for range."""
     if raw.epsg not in _SAME_AS_WGS84:
-        frame = _transformed(raw, frame, config, breaches)
+        frame = _transform_to_degrees(raw, frame, config, breaches)
     outside = (frame["latitude_deg"].abs() > 90) | (frame["longitude_deg"].abs() > 180)
     if outside.any():
         row = frame.filter(outside).row(0, named=True)
@@ -207,7 +207,7 @@ def to_wgs84(raw: RawTable, frame: pl.DataFrame, config: SiteConfig, breaches: l
     return frame
 
 
-def _transformed(raw: RawTable, frame: pl.DataFrame, config: SiteConfig, breaches: list[str]) -> pl.DataFrame:
+def _transform_to_degrees(raw: RawTable, frame: pl.DataFrame, config: SiteConfig, breaches: list[str]) -> pl.DataFrame:
     """A table with coordinates in degrees, of projected ones."""
     import pyproj
 

@@ -55,11 +55,11 @@ def with_route(site: Site, address: Address, config: SiteConfig) -> Site:
         raise InputError("; ".join(breaches), place=shown(address), remedy=remedy)
     digest = hashlib.sha256(f"{site.digest} {hashlib.sha256(data).hexdigest()}".encode()).hexdigest()
     if route["leg"].n_unique() > 1:
-        return replace(_within(site, route["netelement_id"]), digest=digest)
+        return replace(_restrict_to_elements(site, route["netelement_id"]), digest=digest)
     return replace(site, route=Route.validate(route.drop("leg"), cast=True), digest=digest)
 
 
-def _within(site: Site, names: pl.Series) -> Site:
+def _restrict_to_elements(site: Site, names: pl.Series) -> Site:
     """The site's tables of nothing but some elements."""
     kept = names.unique().to_list()
     inside = pl.col("netelement_a").is_in(kept) & pl.col("netelement_b").is_in(kept)

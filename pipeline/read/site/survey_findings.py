@@ -23,7 +23,7 @@ def survey_findings(
     survey's, `ratio, inconsistent`. An antenna off the train's middle shows on all elements of a run, to opposite
     sides on runs in opposite directions.
     """
-    passages = [_passages(frame, config) for frame in epochs]
+    passages = [_residuals_by_passage(frame, config) for frame in epochs]
     if not passages:
         return pl.DataFrame(schema=SURVEY_COLUMNS)
     survey = pl.DataFrame(schema={"netelement_id": pl.String, "survey_m2": pl.Float64})
@@ -63,7 +63,7 @@ SURVEY_COLUMNS: dict[str, type[pl.DataType]] = {
 }
 
 
-def _passages(epochs: pl.DataFrame, config: Configuration) -> pl.DataFrame:
+def _residuals_by_passage(epochs: pl.DataFrame, config: Configuration) -> pl.DataFrame:
     """Median residual of one run on each element, with its variance.
 
     A passage shorter than `user_tau_s` is one observation, and so are several solutions: they share the sky, the

@@ -66,7 +66,9 @@ def typed_table(raw: RawTable, table: str, breaches: list[str]) -> pl.DataFrame 
     """The contract's columns with the contract's types (words as text), or breaches and none."""
     columns = SITE_SCHEMAS[table].columns() | _RECORDED.get(table, {})
     errors: list[InputError] = []
-    read = {name: _read(raw, name, column, errors) for name, column in columns.items() if name in raw.frame.columns}
+    read = {
+        name: _read_column(raw, name, column, errors) for name, column in columns.items() if name in raw.frame.columns
+    }
     known = {name: column for name, column in columns.items() if name not in read or read[name] is not None}
     recorded = raw.frame.with_columns(series for series in read.values() if series is not None)
     frame = conform_to(known, recorded, raw.file, errors, _DEFAULTS)
@@ -89,7 +91,7 @@ def _with_epsg(file: str, frame: pl.DataFrame, named: str | None) -> RawTable:
     return RawTable(file, frame, int(digits))
 
 
-def _read(raw: RawTable, name: str, column: dy.Column, breaches: list[InputError]) -> pl.Series | None:
+def _read_column(raw: RawTable, name: str, column: dy.Column, breaches: list[InputError]) -> pl.Series | None:
     """What stands as text in the type that it spells, identities that are numbers as text; none with a breach."""
     recorded = raw.frame[name]
     if isinstance(column, dy.String) and recorded.dtype.is_integer():

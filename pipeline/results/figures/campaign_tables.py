@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import polars as pl
 
-from pipeline.stages.epochs.clock import reaction_of
+from pipeline.stages.epochs.clock import reaction_or_period_s
 from pipeline.stages.run_row.bounds import (
     CONFIDENCE,
     Estimator,
@@ -121,7 +121,7 @@ def campaign_levels(runs: pl.DataFrame, config: Configuration) -> pl.DataFrame:
     needed = runs.select(
         *(*RUN, "evidence", "failures", "hazardous_max_s", *DECISIVE),
         hazardous_may_max_s=pl.col("failure_hazardous_may_s").list.max(),
-        receiver_needs_s=period_s + reaction_of(period_s, config),
+        receiver_needs_s=period_s + reaction_or_period_s(period_s, config),
     )
     rows = [run | level for run in needed.iter_rows(named=True) for level in level_rows(run, config)]
     quick = pl.col("receiver_needs_s") <= pl.col("allowed_s")

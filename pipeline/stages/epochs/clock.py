@@ -42,7 +42,7 @@ class Clock:
 
     @classmethod
     def at(cls, t_ns: Ints, position_ns: Ints, config: Configuration) -> Clock:
-        """`t_ns`: all epochs; `position_ns`: those with a position."""
+        """The clock of epochs at `t_ns`, of which those at `position_ns` have a position."""
         period_s = nominal_period_s(position_ns)
         limit_s = gap_limit_s(period_s, config.align.gap_reset_s)
         return cls(t_ns, period_s, limit_s, held_s(t_ns, limit_s))
@@ -53,23 +53,23 @@ class Clock:
         return float(self.t_ns[-1] - self.t_ns[0]) / 1e9 if len(self.t_ns) else None
 
 
-def holds(frame: pl.DataFrame, condition: pl.Expr) -> Bools:
-    """Whether a condition holds at each row; null is false."""
+def holds_at_rows(frame: pl.DataFrame, condition: pl.Expr) -> Bools:
+    """Whether a condition holds at each row, shape (rows,); null is false."""
     return frame.select(condition.fill_null(value=False)).to_series().to_numpy()
 
 
 def may_move() -> pl.Expr:
-    """The train moves from this epoch to the next, or nobody knows (DOMAIN section 5.5)."""
+    """Whether the train moves from this epoch to the next; true where nobody knows (DOMAIN section 5.5)."""
     return pl.col("moving").fill_null(value=True)
 
 
 def usable() -> pl.Expr:
-    """An epoch with a position on the track."""
+    """Whether an epoch has a position on the track."""
     return pl.col("path_m").is_not_null() & pl.col("on_track")
 
 
 def unambiguous() -> pl.Expr:
-    """One track is left for the position by what the train knew then."""
+    """Whether one track is left for the position by what the train knew then."""
     return pl.col("gate_probability") >= ONE_TRACK_LEFT
 
 
@@ -82,12 +82,12 @@ def least_belief() -> pl.Expr:
 
 
 def confident(config: Configuration) -> pl.Expr:
-    """The confidence interval along the track is within its limit."""
+    """Whether the confidence interval along the track is within its limit."""
     return pl.col("confidence_m") <= config.lds.ci_limit_m
 
 
 def trusted(config: Configuration) -> pl.Expr:
-    """An epoch whose position is valid, confident and unambiguous (CONTRACT section 3, `mtbf_h`)."""
+    """Whether the position of an epoch is valid, confident and unambiguous (CONTRACT section 3, `mtbf_h`)."""
     return usable() & confident(config) & unambiguous()
 
 
@@ -120,7 +120,7 @@ def crossing_gaps_ns(t_ns: Ints, lds: LdsConfig) -> Ints:
     return np.round(longest_s * NS_PER_S).astype(np.int64)
 
 
-def reaction_of(period_s: Time, config: Configuration) -> Time | float:
+def reaction_or_period_s(period_s: Time, config: Configuration) -> Time | float:
     """Time from detection to negation [s]: as configured, else one period of the positions."""
     return period_s if config.hazards.reaction_s is None else config.hazards.reaction_s
 
@@ -141,7 +141,7 @@ def gap_limit_s(period_s: float | None, gap_reset_s: float) -> float:
 
 
 def gap_limits_s(period_s: Floats, gap_reset_s: float) -> Floats:
-    """The same for the period at each epoch."""
+    """Longest step [s] that is not yet a gap, for the period `period_s` at each epoch."""
     return np.minimum(gap_reset_s, np.maximum(GAP_PERIODS * period_s, 1.0))
 
 
@@ -162,7 +162,7 @@ class Uptime(NamedTuple):
 
 
 def uptime(t_ns: Ints, good: Bools, limit_s: float) -> Uptime:
-    """A loss is an outage that follows upon a good epoch."""
+    """How long `good` held, and how often it was lost: a loss is an outage over `limit_s` after a good epoch."""
     stretches = np.diff(np.concatenate([t_ns[good], t_ns[-1:]])) / NS_PER_S
     lost = stretches > limit_s
     return Uptime(float(stretches[~lost].sum()), int(lost.sum()))
@@ -201,7 +201,7 @@ class Passing(NamedTuple):
     share: float
 
     def instant_ns(self, before_ns: int, after_ns: int) -> int:
-        """The instant, in whole nanoseconds."""
+        """The instant of the passing between its two rows' instants, in whole nanoseconds."""
         return before_ns + round(self.share * (after_ns - before_ns))
 
 

@@ -67,10 +67,11 @@ class Verdicts:
 
     @property
     def evaluated(self) -> Bools:
+        """Epochs at which the monitor passes or fails, shape (epochs,)."""
         return np.asarray(self.state != NOT_EVALUATED)
 
     def at(self, rows: Rows) -> Verdicts:
-        """Those of some epochs."""
+        """The verdicts of some epochs, by their numbers or a mask."""
         return Verdicts(self.value[rows], self.threshold[rows], self.state[rows], self.reason[rows])
 
     @classmethod
@@ -98,7 +99,10 @@ class Verdicts:
 
 
 def states_of(value: Floats, threshold: Floats, evaluated: Bools) -> States:
-    """Beyond its threshold a monitor fails; what is evaluated and cannot be compared is no pass."""
+    """The state by number of each epoch: beyond its threshold a monitor fails.
+
+    What is evaluated and cannot be compared is no pass.
+    """
     failing = ~(np.abs(value) <= threshold)
     return np.where(evaluated, np.where(failing, FAIL, PASS), NOT_EVALUATED).astype(np.int8)
 
@@ -145,8 +149,8 @@ def first_reason(*reasons: tuple[Bools, NotEvaluated | Ints]) -> Ints:
     return first
 
 
-def otherwise(reasons: Ints, others: Ints | NotEvaluated) -> Ints:
-    """The reasons, and where there are none the others."""
+def fill_reasons(reasons: Ints, others: Ints | NotEvaluated) -> Ints:
+    """The reasons by number, and those of `others` where there is none, shape (epochs,)."""
     return np.where(reasons != NO_REASON, reasons, NUMBER[others] if isinstance(others, NotEvaluated) else others)
 
 
@@ -173,7 +177,7 @@ class FailureLog:
     alarms: tuple[AlarmEpisode, ...]
 
     def first_in(self, begin_ns: int, end_ns: int) -> tuple[int, str] | None:
-        """First fail in `begin <= t < end`: time and monitor."""
+        """First fail in `begin <= t < end`: instant [ns] and monitor; None without one."""
         stamps = self.t_ns[self.failing]
         index = int(np.searchsorted(stamps, begin_ns))
         if index == stamps.size or stamps[index] >= end_ns:
@@ -188,7 +192,7 @@ class FailureLog:
         return begun[-1].monitors[0] if stands else None
 
     def start_within(self, begin_ns: int, end_ns: int) -> int | None:
-        """Start of the first alarm that came in `begin <= t < end`."""
+        """Start [ns] of the first alarm that began in `begin <= t < end`; None without one."""
         return next((alarm.start_ns for alarm in self.alarms if begin_ns <= alarm.start_ns < end_ns), None)
 
 
@@ -214,11 +218,11 @@ def failure_log(t_ns: Ints, negated: Bools, monitors: Mapping[str, Verdicts], re
         negated=negated,
         failing=rows,
         first_monitor=tuple(names[first] for first in failed[:, rows].argmax(axis=0).tolist()) if names else (),
-        alarms=tuple(_alarm(t_ns, part, failed[:, part], names, monitors) for part in parts),
+        alarms=tuple(_alarm_episode(t_ns, part, failed[:, part], names, monitors) for part in parts),
     )
 
 
-def _alarm(
+def _alarm_episode(
     t_ns: Ints, rows: Ints, failed: Bools, monitors: list[str], verdicts_of: Mapping[str, Verdicts]
 ) -> AlarmEpisode:
     """One alarm of the failing epochs `rows`; `failed`: of each monitor at which of them."""
@@ -227,11 +231,11 @@ def _alarm(
     # By their first fail; those of one epoch in the order of the contract.
     failing = sorted(np.flatnonzero(failed.any(axis=1)).tolist(), key=lambda monitor: failed[monitor].argmax())
     names = tuple(monitors[monitor] for monitor in failing)
-    peak = max((_peak(verdicts_of[name], slice(first, last + 1)) for name in names), default=0.0)
+    peak = max((_peak_ratio(verdicts_of[name], slice(first, last + 1)) for name in names), default=0.0)
     return AlarmEpisode(first, last, int(t_ns[first]), int(t_ns[last]), names, peak)
 
 
-def _peak(monitor: Verdicts, part: slice) -> float:
+def _peak_ratio(monitor: Verdicts, part: slice) -> float:
     """Largest |value| / threshold where the monitor fails; 0 where neither is recorded."""
     threshold = monitor.threshold[part]
     failing = monitor.fails[part] & (threshold > 0.0)
@@ -251,10 +255,10 @@ class MonitoredEpochs(AlignedEpochs, LdsEpochs):
         return [*super().series(), pl.Series("withheld", self.withheld), *monitors]
 
     def where(self, rows: Ints) -> Self:
-        """Some of the epochs, by their numbers."""
+        """The monitored epochs with these numbers."""
         if rows.size == self.height:
             return self
-        parts = {one.name: _part(getattr(self, one.name), rows) for one in fields(self)}
+        parts = {one.name: _column_at_rows(getattr(self, one.name), rows) for one in fields(self)}
         return type(self)(**parts | {"verdicts": {name: one.at(rows) for name, one in self.verdicts.items()}})
 
     def trusted(self, config: LdsConfig) -> Bools:
@@ -266,7 +270,7 @@ class MonitoredEpochs(AlignedEpochs, LdsEpochs):
         return np.asarray(self.confidence_m <= limit_m)
 
 
-def _part(values: Any, rows: Ints) -> Any:
+def _column_at_rows(values: Any, rows: Ints) -> Any:
     """Some of the epochs of one column; what is not by epoch stays whole."""
     if isinstance(values, np.ndarray):
         return values[rows]

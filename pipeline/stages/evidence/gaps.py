@@ -312,6 +312,7 @@ def _without_contradicted(gaps: list[Gap]) -> list[Gap]:
     wrong = {id(anchor) for gap in gaps if gap.is_unreachable for anchor in gap.anchors}
 
     def is_doubtful(gap: Gap) -> bool:
+        """Whether an anchor of the gap is wrong, or the only one and closed by no route of another gap."""
         anchors = {id(anchor) for anchor in gap.anchors}
         return bool(anchors & wrong) or (len(anchors) == 1 and bool(anchors & (joined - closed)))
 

@@ -1,4 +1,4 @@
-"""Steps of an odometer and of positions from one common stamp to the next.
+"""Whether an odometer is made of the positions of a solution: its steps compared with theirs (DOMAIN section 5.0).
 
 Of the rows as they were written, not of `Odometry`: what that bridges, interpolates or takes from another sensor is
 predicted by its neighbours, and would be taken for a copy of the positions or hide one. So a break is any missing row
@@ -50,7 +50,7 @@ def common_steps(odometer: pl.DataFrame, fixes: pl.DataFrame, config: Configurat
         return None
     epoch_ns = int(times_ns(fixes)[0])
     counted = _distances_of_sensor(odometer, epoch_ns)
-    placed = _placed(fixes, epoch_ns)
+    placed = _positions_in_metres(fixes, epoch_ns)
     if counted is None or placed is None:
         return None
     counter_s, counter_m = counted
@@ -68,10 +68,10 @@ def common_steps(odometer: pl.DataFrame, fixes: pl.DataFrame, config: Configurat
     for recorded_s, own_s in ((counter_s, periods_s[0]), (places_s, periods_s[1])):
         unbroken &= _without_pause(t_s, recorded_s, _PAUSE_PERIODS * own_s)
     reach = max(1, round(_AROUND_S / period_s))
-    chord_m = np.column_stack([around_sum(axis, reach) for axis in moved_m[:, :2].T])
-    driven_m = around_sum(odometer_m, reach)
+    chord_m = np.column_stack([sum_around(axis, reach) for axis in moved_m[:, :2].T])
+    driven_m = sum_around(odometer_m, reach)
     length_m = np.hypot(*chord_m.T)
-    least_m = _MOVING_MPS * around_sum(dt_s, reach)
+    least_m = _MOVING_MPS * sum_around(dt_s, reach)
     ahead = chord_m / np.maximum(length_m, 1e-9)[:, None]
     return Steps(
         t_s=t_s[:-1],
@@ -89,7 +89,7 @@ def _distances_of_sensor(odometer: pl.DataFrame, epoch_ns: int) -> tuple[Floats,
     """Times [s] and distances [m] of a sensor: counted, or its speeds summed up where it hardly counts."""
     distance_m = floats(odometer, "distance_m")
     speed_mps = floats(odometer, "speed_mps")
-    t_s = _since_s(odometer, epoch_ns)
+    t_s = _seconds_since(odometer, epoch_ns)
     known = np.isfinite(distance_m)
     if 2 * np.count_nonzero(known) >= np.count_nonzero(np.isfinite(speed_mps)):
         return (t_s[known], distance_m[known]) if np.count_nonzero(known) >= _FEWEST else None
@@ -100,7 +100,7 @@ def _distances_of_sensor(odometer: pl.DataFrame, epoch_ns: int) -> tuple[Floats,
     return t_s, np.concatenate([[0.0], np.cumsum(0.5 * (speed_mps[1:] + speed_mps[:-1]) * np.diff(t_s))])
 
 
-def _placed(fixes: pl.DataFrame, epoch_ns: int) -> tuple[Floats, tuple[Floats, Floats, Floats]] | None:
+def _positions_in_metres(fixes: pl.DataFrame, epoch_ns: int) -> tuple[Floats, tuple[Floats, Floats, Floats]] | None:
     """Times [s] of valid positions, and east, north, up [m] from the first of them, for differences of near ones."""
     valid = fixes["latitude_deg"].is_finite() & fixes["longitude_deg"].is_finite() & (fixes["fix"] != Fix.NONE.value)
     rows = np.flatnonzero(valid.fill_null(False).to_numpy())
@@ -108,18 +108,18 @@ def _placed(fixes: pl.DataFrame, epoch_ns: int) -> tuple[Floats, tuple[Floats, F
         return None
     latitude, longitude = (np.radians(floats(fixes, f"{axis}_deg")[rows]) for axis in ("latitude", "longitude"))
     meridian_m, normal_m = curvature_radii_m(latitude)
-    north_m = _sums(np.diff(latitude) * meridian_m[1:])
-    east_m = _sums(np.diff(longitude) * (normal_m * np.cos(latitude))[1:])
-    return _since_s(fixes, epoch_ns)[rows], (east_m, north_m, floats(fixes, "height_m")[rows])
+    north_m = _running_sum(np.diff(latitude) * meridian_m[1:])
+    east_m = _running_sum(np.diff(longitude) * (normal_m * np.cos(latitude))[1:])
+    return _seconds_since(fixes, epoch_ns)[rows], (east_m, north_m, floats(fixes, "height_m")[rows])
 
 
-def _since_s(frame: pl.DataFrame, epoch_ns: int) -> Floats:
-    """Times of a stream since an instant [s]."""
+def _seconds_since(frame: pl.DataFrame, epoch_ns: int) -> Floats:
+    """Times of a stream since the instant `epoch_ns` [s]."""
     return np.asarray((times_ns(frame) - epoch_ns) * 1e-9, dtype=np.float64)
 
 
 def _without_pause(t_s: Floats, recorded_s: Floats, longest_s: float) -> Bools:
-    """Whether the recorder has a row at least each `longest_s` around begin and end of each step of `t_s`."""
+    """At each step of `t_s`, whether the recorder has a row at least each `longest_s` around its begin and end."""
     pauses = np.flatnonzero(np.diff(recorded_s) > longest_s)
     broken = np.zeros(t_s.size + 1, dtype=np.int64)
     first = np.searchsorted(t_s, recorded_s[pauses], side="right") - 1
@@ -131,15 +131,15 @@ def _without_pause(t_s: Floats, recorded_s: Floats, longest_s: float) -> Bools:
     return free
 
 
-def around_sum(steps: Floats, reach: int) -> Floats:
-    """Sum from `reach` steps before to `reach` after, fewer at the ends."""
-    sums = _sums(steps)
+def sum_around(steps: Floats, reach: int) -> Floats:
+    """Sum of each step with the `reach` steps before and after it, fewer at the ends, shape (n,)."""
+    sums = _running_sum(steps)
     at = np.arange(steps.size)
     total: Floats = sums[np.minimum(at + reach + 1, steps.size)] - sums[np.maximum(at - reach, 0)]
     return total
 
 
-def _sums(steps: Floats) -> Floats:
+def _running_sum(steps: Floats) -> Floats:
     """Running sum of steps from 0 on, shape (n,) to (n + 1,)."""
     return np.concatenate([[0.0], np.cumsum(steps)])
 
@@ -154,7 +154,7 @@ def correlated_at_stands(steps: Steps, config: EvidenceConfig) -> bool:
 
     A step of a differenced position shares its middle with the next one: two seconds are one independent step.
     """
-    pairs = [_seconds(steps, first, last) for first, last in spans_of(_standing(steps, config))]
+    pairs = [_movement_by_second(steps, first, last) for first, last in spans_of(_inside_stands(steps, config))]
     if not pairs:
         return False
     odometer_m, along_m, length_m = np.concatenate(pairs, axis=1)
@@ -164,18 +164,21 @@ def correlated_at_stands(steps: Steps, config: EvidenceConfig) -> bool:
     return any(_correlates(odometer_m, other_m, time_s, config) for other_m in (along_m, length_m))
 
 
-def _standing(steps: Steps, config: EvidenceConfig) -> Bools:
-    """Within stands, away from their ends, by the positions: an odometer of their steps without sign never stands."""
+def _inside_stands(steps: Steps, config: EvidenceConfig) -> Bools:
+    """At which steps the train stands, away from the stand's ends.
+
+    By the positions: an odometer of their steps without sign never stands.
+    """
     reach = max(1, round(_EDGE_S / steps.period_s))
     least_m = config.follows_stand_mps * 2.0 * _EDGE_S
     still = steps.unbroken & ~steps.moving
     for moved_m in (steps.along_m, steps.across_m):
-        still &= np.abs(around_sum(moved_m, reach)) <= least_m
-    inside: Bools = around_sum(still.astype(np.float64), reach) > 2 * reach + 0.5
+        still &= np.abs(sum_around(moved_m, reach)) <= least_m
+    inside: Bools = sum_around(still.astype(np.float64), reach) > 2 * reach + 0.5
     return inside
 
 
-def _seconds(steps: Steps, first: int, last: int) -> Floats:
+def _movement_by_second(steps: Steps, first: int, last: int) -> Floats:
     """Odometer, along, and length of the position's step, over each second of a stand, shape (3, seconds) [m]."""
     stride = max(1, round(_STEP_S / steps.period_s))
     count = (last + 1 - first) // stride
@@ -187,8 +190,11 @@ def _seconds(steps: Steps, first: int, last: int) -> Floats:
 
 
 def _correlates(odometer_m: Floats, other_m: Floats, time_s: float, config: EvidenceConfig) -> bool:
-    """Steps beyond four usual ones count as four: a train that creeps moves both, and its wheel is no copy."""
-    first, second = (_usual(steps_m) for steps_m in (odometer_m, other_m))
+    """Whether two series of steps [m] over `time_s` of stands correlate beyond both limits.
+
+    Steps beyond four usual ones count as four: a train that creeps moves both, and its wheel is no copy.
+    """
+    first, second = (_clip_outliers(steps_m) for steps_m in (odometer_m, other_m))
     if not (first.any() and second.any()):
         return False
     r = float(first @ second) / float(np.sqrt((first @ first) * (second @ second)))
@@ -196,8 +202,11 @@ def _correlates(odometer_m: Floats, other_m: Floats, time_s: float, config: Evid
     return abs(r) > config.follows_correlation and abs(r) * np.sqrt(0.5 * time_s) > config.follows_sigmas
 
 
-def _usual(steps_m: Floats) -> Floats:
-    """About their mean, and none beyond four deviations (by the median); none at all where most are alike."""
+def _clip_outliers(steps_m: Floats) -> Floats:
+    """The steps less their median, clipped to four deviations (by the median), about their mean [m].
+
+    All zero where most are alike.
+    """
     apart_m = steps_m - median(steps_m)
     sigma_m = median(np.abs(apart_m)) / 0.674490
     clipped = np.clip(apart_m, -4.0 * sigma_m, 4.0 * sigma_m)
@@ -250,16 +259,16 @@ def follows_positions(odometer: pl.DataFrame, fixes: pl.DataFrame, config: Confi
     steps = common_steps(odometer, fixes, config)
     if steps is None:
         return NOT_TESTED
-    return Follows(_ratio(steps, config.evidence), correlated_at_stands(steps, config.evidence))
+    return Follows(_unexplained_ratio(steps, config.evidence), correlated_at_stands(steps, config.evidence))
 
 
-def _ratio(steps: Steps, config: EvidenceConfig) -> float | None:
+def _unexplained_ratio(steps: Steps, config: EvidenceConfig) -> float | None:
     """V: what the positions leave unexplained of an odometer's step, over the least that a series leaves alone."""
-    rows = _spread(_in_motion(steps), config.follows_steps_most)
+    rows = _thin_evenly(_rows_in_motion(steps), config.follows_steps_most)
     if rows.size < config.follows_steps_least:
         return None
     own = _neighbours(steps.odometer_m, rows, _OWN)
-    both = np.column_stack([own, _around(steps.along_m, rows, _OTHERS)])
+    both = np.column_stack([own, _steps_around(steps.along_m, rows, _OTHERS)])
     left_m = _unexplained(steps.odometer_m[rows], both)
     alone_m = [_unexplained(steps.odometer_m[rows], own)]
     alone_m.append(_unexplained(steps.across_m[rows], _neighbours(steps.across_m, rows, _OWN)))
@@ -267,12 +276,12 @@ def _ratio(steps: Steps, config: EvidenceConfig) -> float | None:
         up_m = np.nan_to_num(steps.up_m)
         if np.ptp(up_m[rows]) > _LEAST_M:
             alone_m.append(_unexplained(up_m[rows], _neighbours(up_m, rows, _OWN)) / _HEIGHT_OVER_CROSS)
-    least_alone_m = np.min([_sigmas_m(residuals_m) for residuals_m in alone_m], axis=0)
-    return float(np.max(np.maximum(_sigmas_m(left_m), _LEAST_M) / np.maximum(least_alone_m, 1e-9)))
+    least_alone_m = np.min([_sigmas_by_quantile_m(residuals_m) for residuals_m in alone_m], axis=0)
+    return float(np.max(np.maximum(_sigmas_by_quantile_m(left_m), _LEAST_M) / np.maximum(least_alone_m, 1e-9)))
 
 
-def _in_motion(steps: Steps) -> Ints:
-    """Steps around which both recorders went on without a break, and the train moved, as far as predictors reach."""
+def _rows_in_motion(steps: Steps) -> Ints:
+    """Numbers of the steps around which, as far as predictors reach, the train moved and no recorder had a break."""
     good = steps.moving & steps.unbroken
     count = np.concatenate([[0], np.cumsum(good)])
     rows = np.arange(_OTHERS, good.size - _OTHERS)
@@ -280,23 +289,26 @@ def _in_motion(steps: Steps) -> Ints:
     return np.asarray(rows[whole])
 
 
-def _spread(rows: Ints, most: int) -> Ints:
-    """At most so many of the rows, evenly spread."""
+def _thin_evenly(rows: Ints, most: int) -> Ints:
+    """At most `most` of the rows, evenly spread."""
     return rows if rows.size <= most else rows[np.linspace(0, rows.size - 1, most).astype(np.int64)]
 
 
-def _around(steps_m: Floats, rows: Ints, reach: int) -> Floats:
+def _steps_around(steps_m: Floats, rows: Ints, reach: int) -> Floats:
     """The steps from `reach` before to `reach` after each row, shape (rows, 2 reach + 1)."""
     return np.asarray(steps_m[rows[:, None] + np.arange(-reach, reach + 1)])
 
 
 def _neighbours(steps_m: Floats, rows: Ints, reach: int) -> Floats:
-    """The same without the row itself, shape (rows, 2 reach)."""
-    return np.delete(_around(steps_m, rows, reach), reach, axis=1)
+    """The steps from `reach` before to `reach` after each row without that of the row, shape (rows, 2 reach)."""
+    return np.delete(_steps_around(steps_m, rows, reach), reach, axis=1)
 
 
 def _unexplained(wanted_m: Floats, by_m: Floats) -> Floats:
-    """Absolute residuals of a linear prediction [m], larger by what fitting so many numbers takes off."""
+    """Absolute residuals [m] of `wanted_m` (rows,) predicted from `by_m` (rows, predictors) by least squares.
+
+    Scaled by sqrt(n / (n - k - 1)) for what fitting k numbers to n rows takes off.
+    """
     columns = by_m - by_m.mean(axis=0)
     wanted = wanted_m - wanted_m.mean()
     count, fitted = columns.shape
@@ -306,7 +318,7 @@ def _unexplained(wanted_m: Floats, by_m: Floats) -> Floats:
     return np.asarray(np.abs(wanted - columns @ weights) * np.sqrt(count / (count - fitted - 1.0)))
 
 
-def _sigmas_m(residuals_m: Floats) -> Floats:
+def _sigmas_by_quantile_m(residuals_m: Floats) -> Floats:
     """Sigma [m] of a normal variable whose absolute value has these quantiles, by each of `_QUANTILES`."""
     parts, of_normal = zip(*_QUANTILES, strict=True)
     return np.asarray(np.quantile(residuals_m, parts) / np.array(of_normal))

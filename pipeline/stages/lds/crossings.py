@@ -74,6 +74,7 @@ class Journey:
 
     @property
     def has_odometer(self) -> bool:
+        """Whether any epoch has a known odometer distance."""
         return self.with_odometer.size > 0
 
     def absence(self, epochs: slice) -> PassageStatus:
@@ -164,6 +165,7 @@ class Window(NamedTuple):
     close_m: float
 
     def holds(self, distance_m: float) -> bool:
+        """Whether a distance lies in the window, its ends included."""
         return self.open_m <= distance_m <= self.close_m
 
 

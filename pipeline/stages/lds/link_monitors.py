@@ -20,8 +20,8 @@ from pipeline.stages.epochs.verdicts import (
     NO_SIGMA,
     NUMBER,
     Verdicts,
+    fill_reasons,
     first_reason,
-    otherwise,
     verdicts,
 )
 from pipeline.stages.lds.crossings import Crossing, Journey
@@ -381,7 +381,7 @@ class LinkDistance:
         """Verdicts of all epochs."""
         self._evaluate_before_change(self._fails.size - 1)
         never = first_reason((np.isnan(self._value), NotEvaluated.NEVER_VALIDATED))
-        return verdicts(self._value, self._threshold, otherwise(self._reason, never))
+        return verdicts(self._value, self._threshold, fill_reasons(self._reason, never))
 
 
 def _order_reasons(journey: Journey, disabled: bool, config: Configuration) -> Ints:

@@ -7,7 +7,7 @@ from typing import Literal
 
 import numpy as np
 
-from pipeline.stages.epochs.verdicts import NO_POSITION, NO_SIGMA, first_reason, otherwise
+from pipeline.stages.epochs.verdicts import NO_POSITION, NO_SIGMA, fill_reasons, first_reason
 from pipeline.stages.monitors.axis import AlongEpochs, AxisSeries, Source, along_series, errors_of, time_steps
 from pipeline.stages.monitors.noise import NoiseMeter, Sampler
 from pipeline.stages.odometry.driven import is_moving
@@ -47,7 +47,7 @@ def along_axis(epochs: AlignedEpochs, config: Configuration) -> Axis:
     """GNSS minus odometer along the track (DIAG eq. 1-3); arguments as of `axes_of`."""
     t_s = (epochs.t_ns - epochs.t_ns[0]) * 1e-9
     matched = _match_reasons(epochs)
-    reasons = otherwise(matched, epochs.odometer_reason)
+    reasons = fill_reasons(matched, epochs.odometer_reason)
     series = _along(epochs, t_s, reasons, config)
     return Axis("along", series, _moving(epochs, t_s, config)[series.epoch], reasons, config)
 
@@ -68,7 +68,7 @@ def axes_of(epochs: AlignedEpochs, config: Configuration, along: Axis | None = N
     """
     t_s = (epochs.t_ns - epochs.t_ns[0]) * 1e-9
     matched = _match_reasons(epochs)
-    up_reasons = otherwise(matched, first_reason((np.isnan(epochs.vertical_m), NO_HEIGHT)))
+    up_reasons = fill_reasons(matched, first_reason((np.isnan(epochs.vertical_m), NO_HEIGHT)))
     moving = _moving(epochs, t_s, config)
     built = (
         ("cross", _across(epochs, t_s, matched, "cross", config), matched),

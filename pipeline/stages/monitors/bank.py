@@ -15,9 +15,9 @@ from pipeline.stages.epochs.verdicts import (
     NUMBER,
     PASS,
     Verdicts,
+    fill_reasons,
     first_reason,
     no_verdicts,
-    otherwise,
     states_of,
     verdicts,
 )
@@ -140,11 +140,11 @@ class AxisBank:
         unknown[epochs] = np.isnan(self.noise_m[epochs]).any(axis=1)
         too_large: Bools = np.any(self.noise_m > self._config.noise_limit_m, axis=1)
         of_noise = first_reason((unknown, NOISE_UNKNOWN), (too_large, NOISE_TOO_LARGE))
-        reasons = otherwise(self.axis.reasons, of_noise)
+        reasons = fill_reasons(self.axis.reasons, of_noise)
         if self._blind is not None:
-            reasons = otherwise(reasons, first_reason((np.isfinite(self.value).any(axis=1), self._blind)))
-        reasons = otherwise(reasons, FIRST_EPOCH)
-        disabled = otherwise(self.axis.reasons, DISABLED)
+            reasons = fill_reasons(reasons, first_reason((np.isfinite(self.value).any(axis=1), self._blind)))
+        reasons = fill_reasons(reasons, FIRST_EPOCH)
+        disabled = fill_reasons(self.axis.reasons, DISABLED)
         return {
             f"{self.axis.name}_{scale}": verdicts(
                 self.value[:, index],

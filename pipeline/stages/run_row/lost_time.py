@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import polars as pl
 
-from pipeline.stages.epochs.clock import Clock, reaction_of
+from pipeline.stages.epochs.clock import Clock, reaction_or_period_s
 from pipeline.stages.epochs.verdicts import Verdicts
 from pipeline.stages.judge.judged import JudgedEpochs
 from schemas.arrays import NS_PER_S, Bools, Floats, Ints, times_ns
@@ -302,7 +302,7 @@ def _time_lost_to_rate_s(run: Mapping[str, Any], config: Configuration) -> float
     if not run["gnss_rate_hz"]:
         return 0.0
     period_s = 1.0 / run["gnss_rate_hz"]
-    needs_s = period_s + reaction_of(period_s, config)
+    needs_s = period_s + reaction_or_period_s(period_s, config)
     failures = zip(run["failure_hazardous_may_s"] or (), run["failure_accepted"] or (), strict=True)
     return sum(
         float(spent_s)

@@ -153,7 +153,7 @@ def failures_of_run(run: RunRow) -> list[Failure]:
 
 def count_kept_and_exceeded(failures: Sequence[Failure], allowed_s: float) -> tuple[int, int]:
     """How many failures kept the allowed time [s] whatever is unknown, and how many certainly exceeded it."""
-    kept = [keeps_budget(spent_s, may_s, Judgement(is_accepted), allowed_s) for spent_s, may_s, is_accepted in failures]
+    kept = [keeps_budget(spent_s, may_s, Judgement(accepted), allowed_s) for spent_s, may_s, accepted in failures]
     return kept.count(True), kept.count(False)
 
 

@@ -8,7 +8,7 @@ import numpy as np
 import polars as pl
 
 from pipeline.results.places import train_path_m
-from pipeline.stages.epochs.clock import confident, crossing_gaps_ns, holds, unambiguous, usable
+from pipeline.stages.epochs.clock import confident, crossing_gaps_ns, holds_at_rows, unambiguous, usable
 from schemas.arrays import Bools, Ints, flags, floats, times_ns
 from schemas.config import Configuration
 
@@ -46,9 +46,9 @@ def states_of(epochs: pl.DataFrame, alarm_starts: pl.Series, config: Configurati
         (wrong & in_use, SpanState.WRONG_IN_USE),
         (wrong & ~np.isfinite(floats(epochs, "error_low_m")), SpanState.WRONG_TRACK),
         (wrong, SpanState.WRONG),
-        (~holds(epochs, usable() & pl.col("confidence_m").is_not_null()), SpanState.OUTAGE),
-        (~holds(epochs, unambiguous()), SpanState.AMBIGUOUS),
-        (~holds(epochs, confident(config)), SpanState.CONFIDENCE),
+        (~holds_at_rows(epochs, usable() & pl.col("confidence_m").is_not_null()), SpanState.OUTAGE),
+        (~holds_at_rows(epochs, unambiguous()), SpanState.AMBIGUOUS),
+        (~holds_at_rows(epochs, confident(config)), SpanState.CONFIDENCE),
         (starts, SpanState.ALARM),
         (~in_use, SpanState.AFTER_ALARM),
         (_have_judgement(epochs, "right"), SpanState.RIGHT),

@@ -12,7 +12,16 @@ from itertools import combinations
 import numpy as np
 import polars as pl
 
-from pipeline.stages.epochs.clock import Clock, held_s, holds, may_move, nominal_period_s, position_ns, trusted, uptime
+from pipeline.stages.epochs.clock import (
+    Clock,
+    held_s,
+    holds_at_rows,
+    may_move,
+    nominal_period_s,
+    position_ns,
+    trusted,
+    uptime,
+)
 from pipeline.stages.epochs.verdicts import FailureLog, Verdicts, failure_log
 from pipeline.stages.monitors.single import channel_monitor, on_path_of, paired
 from pipeline.stages.run_row.bounds import independent_episodes
@@ -171,12 +180,12 @@ def _diagnose(epochs: pl.DataFrame, monitors: tuple[str, ...], judged: pl.Expr, 
     clock = Clock.of(epochs, config)
     verdicts = {name: Verdicts.of_table(epochs, name) for name in monitors}
     fails = failure_log(clock.t_ns, np.zeros(clock.t_ns.size, dtype=np.bool_), verdicts, config.lds.recovery_s)
-    evaluated = holds(epochs, judged)
-    working = evaluated & holds(epochs, pl.col("trusted"))
+    evaluated = holds_at_rows(epochs, judged)
+    working = evaluated & holds_at_rows(epochs, pl.col("trusted"))
     for span in fails.alarms:
         until_ns = span.end_ns + round(config.lds.recovery_s * 1e9)
         working &= (clock.t_ns < span.start_ns) | (clock.t_ns > until_ns)
-    known, wrong, moving = (holds(epochs, pl.col(name)) for name in ("known", "wrong", "moving"))
+    known, wrong, moving = (holds_at_rows(epochs, pl.col(name)) for name in ("known", "wrong", "moving"))
     return _Diagnosed(clock, fails, working, known, known & wrong, moving)
 
 

@@ -75,7 +75,7 @@ def test_two_banks_on_the_same_faults(bench: Bench, monkeypatch: pytest.MonkeyPa
     def never(*_: object) -> None:
         raise AssertionError("replayed again")
 
-    monkeypatch.setattr(command, "injected", never)
+    monkeypatch.setattr(command, "inject_fault", never)
     bench.run(plan)
     assert contents(bench.folder / "out") == first
 

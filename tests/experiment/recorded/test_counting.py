@@ -7,7 +7,7 @@ import polars as pl
 import pytest
 
 from datasets.experiment.recorded.plan import PlannedFault, RecordedPlan
-from datasets.experiment.recorded.tables import bounded_share, cells_table, passes, pmd_table
+from datasets.experiment.recorded.tables import bounded_share, cells_table, independent_passes, pmd_table
 from datasets.faults import FaultKind
 from schemas.conform import dtypes
 from schemas.experiment import ExperimentInjections
@@ -36,18 +36,18 @@ def watches(*rows: tuple[str, float, float]) -> pl.DataFrame:
 )
 def test_passes_share_no_time(rows: list[tuple[str, float, float]], count: int) -> None:
     frame = watches(*rows) if rows else watches(("a", 0.0, 1.0)).clear()
-    assert passes(frame, 300.0).number == count
+    assert independent_passes(frame, 300.0).number == count
 
 
 def test_passes_of_unlike_size_are_worth_less() -> None:
     """31 injections in one pass and one in each of nine others: 40^2 / (31^2 + 9). Four in each of ten: ten."""
     lone = [("a", 1_000.0 * number, 10.0) for number in range(1, 10)]
-    assert passes(watches(*[("a", float(second), 10.0) for second in range(31)], *lone), 300.0) == (
+    assert independent_passes(watches(*[("a", float(second), 10.0) for second in range(31)], *lone), 300.0) == (
         10,
         pytest.approx(1600 / 970),
     )
     even = [("a", 1_000.0 * number + second, 10.0) for number in range(10) for second in range(4)]
-    assert passes(watches(*even), 300.0) == (10, 10.0)
+    assert independent_passes(watches(*even), 300.0) == (10, 10.0)
 
 
 def test_bounds_are_those_of_the_passes_alone() -> None:

@@ -8,8 +8,8 @@ import numpy as np
 import polars as pl
 import pytest
 
-from datasets.experiment.recorded.baseline import Baseline, Onset, baseline_of, numbered, onsets_of, room_of
-from datasets.experiment.recorded.outcome import Injected, injected, outcome_row
+from datasets.experiment.recorded.baseline import Baseline, Onset, baseline_of, number_onsets, onsets_of, room_of
+from datasets.experiment.recorded.outcome import InjectedFault, inject_fault, outcome_row
 from datasets.experiment.recorded.plan import Bank, PlannedFault, RecordedPlan
 from datasets.experiment.tables import Row
 from datasets.faults import FaultKind
@@ -35,10 +35,10 @@ def _drawn(base: Baseline, fault: PlannedFault, count: int) -> list[Onset]:
     plan = RecordedPlan(per_cell=count, faults=(fault,))
     room = room_of([base], plan.quiet_s)
     cells = plan.cells(20.0)
-    return numbered(cells, onsets_of([room], cells, plan))
+    return number_onsets(cells, onsets_of([room], cells, plan))
 
 
-def _brute_force(journey: Journey, config: Configuration, found: Injected) -> RunTables:
+def _brute_force(journey: Journey, config: Configuration, found: InjectedFault) -> RunTables:
     return replay(inject(journey.run, found.fault, journey.site), journey.site, journey.vehicle, config)
 
 
@@ -67,7 +67,7 @@ def test_detects_at_the_same_epoch_as_a_replay_from_the_start(journey: Journey, 
     onsets = _drawn(base, fault, 1)
     assert onsets
     for onset in onsets:
-        found = injected(base, onset)
+        found = inject_fault(base, onset)
         row = outcome_row(base, onset, found)
         tables = _brute_force(journey, config, found)
         assert row["time_to_detect_s"] == _first_alarm_s(tables, onset, onset.cell.watch_s)
@@ -84,7 +84,7 @@ def test_a_ramp_in_one_range_follows_the_sky_as_in_a_replay_from_the_start() -> 
     base = _baseline(sky, Configuration())
     fault = PlannedFault(kind=FaultKind.RAMP, target="satellite", rates_mps=(1.0,), both_ways=False)
     (onset,) = _drawn(base, fault, 1)
-    found = injected(base, onset)
+    found = inject_fault(base, onset)
     row = outcome_row(base, onset, found)
     assert row["target"] in base.satellites_at(onset.t_ns)
     assert row["time_to_detect_s"] == _first_alarm_s(_brute_force(sky, Configuration(), found), onset, 245.0)
@@ -109,7 +109,7 @@ def unnoticed(journey: Journey) -> tuple[Row, RunTables, Onset]:
     fault = PlannedFault(kind=FaultKind.RAMP, rates_mps=(0.25,), watch_s=(end_ns - onset_ns) / NS_PER_S)
     cell = RecordedPlan(faults=(fault,)).cells(20.0)[0]
     onset = Onset(0, cell, journey.run.run_id, onset_ns, 0.0)
-    found = injected(base, onset)
+    found = inject_fault(base, onset)
     return outcome_row(base, onset, found), _brute_force(journey, BLIND, found), onset
 
 

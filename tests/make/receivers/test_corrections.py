@@ -90,5 +90,5 @@ def test_the_command_says_what_it_corrected(tmp_path: Path, capsys: pytest.Captu
     config = tmp_path / "c.toml"
     config.write_text('[[ingest.correct]]\nstream = "gnss"\nshift_s = 2.0\n')
     arguments = ["convert", str(tmp_path / "a.pos"), "--out", str(tmp_path / "run"), "--config", str(config)]
-    assert cli._guarded(arguments, debug=False) == 0
+    assert cli._run_guarded(arguments, debug=False) == 0
     assert "corrected: gnss: shift_s 2.0" in capsys.readouterr().out

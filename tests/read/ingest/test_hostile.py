@@ -19,7 +19,7 @@ from pydantic import ValidationError
 
 from pipeline.make.receivers import gather
 from pipeline.read.ingest import mcap_block, read_run
-from pipeline.read.ingest.correct import corrected
+from pipeline.read.ingest.correct import correct_run
 from pipeline.read.ingest.describe import describe_log
 from pipeline.read.ingest.layout import UndecodableError, constant, fixed, layout_of
 from pipeline.read.ingest.layout_decoder import LayoutDecoder
@@ -263,7 +263,7 @@ def test_a_pipe_is_refused_before_it_blocks(tmp_path: Path) -> None:
 def test_a_shift_that_64_bits_do_not_hold_is_refused() -> None:
     shift = StreamCorrection(stream="gnss", shift_s=8e9)
     with pytest.raises(InputError, match=r"after \[\[ingest.correct\]\]: column t: has missing values"):
-        corrected(samples.run(), [shift])
+        correct_run(samples.run(), [shift])
     with pytest.raises(ValidationError, match="less than or equal to 9000000000"):
         StreamCorrection(stream="gnss", shift_s=1e300)
 

@@ -116,7 +116,7 @@ def test_messages_that_hold_the_same_fields_are_what_the_parser_says(drawn):
 
 
 def test_messages_that_hold_the_same_fields_need_no_second_parser(monkeypatch):
-    monkeypatch.delattr(json_columns, "_read")
+    monkeypatch.delattr(json_columns, "_read_with_arrow")
     decoder = JsonDecoder(CHANNEL, TYPES)
     for name in ("x", "é"):
         contents = [ALIKE, b' {"ok": false, "t": {"sec": -3}, "a": 1e3, "name": "%s"}\n' % name.encode()]

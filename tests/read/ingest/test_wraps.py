@@ -15,7 +15,7 @@ from pipeline.make.receivers.convert import words_for_dropped
 from pipeline.read.ingest import read_run
 from pipeline.read.ingest.conform import conform
 from pipeline.read.ingest.csv_draft import draft_mapping
-from pipeline.read.ingest.wraps import counted_on, wrap_of
+from pipeline.read.ingest.wraps import unwrap, wrap_of
 from schemas.config import Configuration, IngestConfig, settings_from
 from schemas.errors import ConfigError
 from schemas.run import RunLog
@@ -49,7 +49,7 @@ def test_a_counter_is_counted_on_over_its_end(size: int, count: float, start: fl
     found = wrap_of(shown * count, np.arange(ROWS) * SECOND)
     assert found is not None
     assert (found.size, found.times, found.certain) == (pytest.approx(size * count), 1, True)
-    whole_counts = counted_on(shown * count, found.size)
+    whole_counts = unwrap(shown * count, found.size)
     assert whole_counts - whole_counts[0] == pytest.approx((true - true[0]) * count, abs=1e-6 * size)
 
 
@@ -58,13 +58,13 @@ def test_a_train_that_turns_back_wraps_the_other_way_too() -> None:
     found = wrap_of(true % 65536)
     assert found is not None
     assert (found.times, found.certain) == (2, True)
-    assert counted_on(true % 65536, 65536.0).tolist() == true.tolist()
+    assert unwrap(true % 65536, 65536.0).tolist() == true.tolist()
 
 
 def test_an_empty_cell_changes_nothing() -> None:
     shown = distance(start=60_000.0) % 65536
     shown[[10, 99, 100, 150]] = np.nan
-    counted = counted_on(shown, 65536.0)
+    counted = unwrap(shown, 65536.0)
     known = np.isfinite(shown)
     assert (known == np.isfinite(counted)).all()
     assert counted[known].tolist() == distance(start=60_000.0)[known].tolist()

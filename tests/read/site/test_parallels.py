@@ -9,7 +9,7 @@ import polars as pl
 import pytest
 
 from pipeline.read.site.alike import parallel_findings
-from pipeline.read.site.neighbours import neighbours
+from pipeline.read.site.neighbours import neighbour_table
 from schemas.config import Configuration, SiteConfig
 from tests.stages.matching.builders import line, matched, run, site
 from tests.stages.matching.ladder import ladder
@@ -78,11 +78,11 @@ def test_neighbours_are_named_with_what_tells_them_apart_and_where() -> None:
     """b lies 1.5, 4.4 and 6 m beside a, 1 km each: at 0.3 m a switch tells from 2.06 m on, offsets from 5.16 m."""
     b = np.array([(0.0, 1.5), (1000.0, 1.5), (1040.0, 4.4), (2000.0, 4.4), (2040.0, 6.0), (3000.0, 6.0)])
     place = site({"a": line((0, 0), (3000, 0)), "b": b}, sigma_m=0.3)
-    table = neighbours(place, Configuration())
+    table = neighbour_table(place, Configuration())
     assert table["told_apart_by"].to_list() == ["nothing but a route or a read", "a switch taken", "the offset"]
     assert table["apart_m"].to_list() == pytest.approx([1.5, 4.4, 6.0], abs=0.03)
     assert table["from_m"].to_list() == pytest.approx([0.0, 1020.0, 2020.0], abs=30.0)
     assert table["switch_tells_from_m"].to_list() == pytest.approx([2.06] * 3, abs=0.02)
     assert table["offset_tells_from_m"].to_list() == pytest.approx([5.16] * 3, abs=0.02)
     route = pl.DataFrame({"netelement_id": ["a"], "direction": ["AB"]})
-    assert neighbours(replace(place, route=route), Configuration()).is_empty()
+    assert neighbour_table(replace(place, route=route), Configuration()).is_empty()

@@ -12,7 +12,7 @@ from pipeline.stages.epochs.clock import (
     crossing_gaps_ns,
     gap_limit_s,
     held_s,
-    holds,
+    holds_at_rows,
     least_belief,
     nominal_period_s,
     outages_s,
@@ -146,8 +146,8 @@ POSITIONS = pl.DataFrame(
 
 
 def test_a_position_is_trusted_on_a_track_that_is_sure_and_within_its_limit() -> None:
-    assert holds(POSITIONS, usable()).tolist() == flags("+--+++-").tolist()
-    assert holds(POSITIONS, trusted(CONFIG)).tolist() == flags("+------").tolist()
+    assert holds_at_rows(POSITIONS, usable()).tolist() == flags("+--+++-").tolist()
+    assert holds_at_rows(POSITIONS, trusted(CONFIG)).tolist() == flags("+------").tolist()
     assert POSITIONS.select(least_belief()).to_series().to_list() == [0.6, 1.0, 1.0, 1.0, 0.5, 1.0, 1.0]
 
 

@@ -6,7 +6,7 @@ import numpy as np
 import polars as pl
 import pytest
 
-from datasets.constellation import GALILEO, GPS, visible
+from datasets.constellation import GALILEO, GPS, visible_satellites
 from pipeline.stages.epochs.verdicts import NO_POSITION
 from pipeline.stages.monitors.pseudorange import (
     AMBIGUOUS,
@@ -25,7 +25,7 @@ from tests.frames import verdict_table
 
 T0 = datetime(2024, 3, 20, 6, 27, tzinfo=UTC)
 HEADING_DEG, SLOPE, SURVEY_M = 35.0, 0.02, 0.7
-SKY = visible(GPS + GALILEO, np.array([int(T0.timestamp()) * 1_000_000_000]), 50.85, 4.35)
+SKY = visible_satellites(GPS + GALILEO, np.array([int(T0.timestamp()) * 1_000_000_000]), 50.85, 4.35)
 
 
 def monitored(epochs, satellites, config):

@@ -536,12 +536,12 @@ def test_a_result_with_and_without_areas(result: Path) -> None:
 
 def test_the_command(result: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("COLUMNS", "80")
-    assert cli._guarded(["claim", str(result)], debug=False) == 0
+    assert cli._run_guarded(["claim", str(result)], debug=False) == 0
     lines = capsys.readouterr().out.splitlines()
     assert any(line.startswith("safe_front_end") and "not met" in line for line in lines)
     assert max(map(len, lines[1 : 1 + len(requirements(PROFILE))])) <= 80
-    assert cli._guarded(["claim", str(result), "--json"], debug=False) == 0
+    assert cli._run_guarded(["claim", str(result), "--json"], debug=False) == 0
     answer = json.loads(capsys.readouterr().out)
     assert (answer["profile"], answer["version"], len(answer["sources"])) == ("lu-2023", "1", 3)
     assert len(answer["requirements"]) == len(requirements(PROFILE))
-    assert cli._guarded(["claim", str(result), "--profile", "lu-2050"], debug=False) == 2
+    assert cli._run_guarded(["claim", str(result), "--profile", "lu-2050"], debug=False) == 2

@@ -12,7 +12,7 @@ import pytest
 from benchmarks.truth.plausibility import applies, fit_of, is_reported
 from datasets.random_trials import random_trial
 from pipeline.one_run import replay as replayed
-from pipeline.read.ingest.correct import corrected
+from pipeline.read.ingest.correct import correct_run
 from pipeline.stages.clean.clean import clean
 from pipeline.studies.calibration.calibrate import calibrate
 from pipeline.studies.plausibility.check import CONFIGURATION, Cause, FitState, explain_factor, explain_lag
@@ -50,7 +50,7 @@ def test_what_is_wrong_is_reported_and_its_lines_mend_it(wrong: Wrong, trips: li
     if lines is None:
         return
     config = settings_from({**tomllib.loads(lines)["ingest"]}, IngestConfig, "the lines")
-    mended = fit_of(corrected(changed, config.correct), drawn.site)
+    mended = fit_of(correct_run(changed, config.correct), drawn.site)
     assert not isinstance(mended, str)
     assert mended.impossible == ()
 
@@ -188,7 +188,7 @@ def test_a_correction_of_what_is_not_there_is_refused() -> None:
     for wrong in ({"stream": "satellites", "shift_s": 1.0}, {"stream": "odometer", "factors": {"speed": 2.0}}):
         config = IngestConfig.model_validate({"correct": [wrong]})
         with pytest.raises(ConfigError, match="correct"):
-            corrected(run, config.correct)
+            correct_run(run, config.correct)
 
 
 def _fit(run: RunLog, site: Site | None = None, vehicle: Vehicle | None = None) -> Fit:

@@ -8,7 +8,7 @@ import numpy as np
 import polars as pl
 import pytest
 
-from datasets.faults import FaultSpec, faults_table, offset_m
+from datasets.faults import FaultSpec, fault_offset_m, faults_table
 from datasets.inject import inject, load_faults
 from pipeline.one_run import monitor_alone, replay
 from pipeline.studies.undetected.profile import epoch_of, profile_at
@@ -31,7 +31,7 @@ def file(tmp_path: Path) -> Path:
 def test_a_profile_runs_in_straight_lines_from_row_to_row(file: Path) -> None:
     (fault,) = load_faults(file)
     at_s = np.array([0.0, 10.0, 15.0, 20.0, 25.0, 30.0, 99.0])
-    found = offset_m(fault, at_s, np.random.default_rng(0))
+    found = fault_offset_m(fault, at_s, np.random.default_rng(0))
     assert found.tolist() == [0.0, 0.0, 2.5, 5.0, 2.0, -1.0, -1.0]
     assert faults_table([fault], 0, 100_000_000_000)["size"].item() == 5.0
 
@@ -41,7 +41,7 @@ def test_what_is_no_profile_is_one_error(file: Path, text: str) -> None:
     (file.parent / "p.csv").write_text(text)
     (fault,) = load_faults(file)
     with pytest.raises(ConfigError, match=r"p\.csv"):
-        offset_m(fault, np.zeros(1), np.random.default_rng(0))
+        fault_offset_m(fault, np.zeros(1), np.random.default_rng(0))
 
 
 def test_a_fault_along_the_site_moves_the_position_on_its_path_and_not_beside_it() -> None:
