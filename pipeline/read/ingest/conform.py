@@ -31,8 +31,11 @@ def conform(frame: pl.DataFrame, stream: Stream, place: str, breaches: list[Inpu
         breaches.append(InputError("has no rows", place=place, expected="at least one", remedy="Record the stream."))
     result = conform_to(STREAM_SCHEMAS[stream].columns(), frame, place, breaches, DEFAULTS)
     if stream == "odometer" and {"distance_m", "speed_mps"} <= set(result.columns):
-        neither = result["distance_m"].is_null() & result["speed_mps"].is_null()
-        if neither.any():
+        counters = result["distance_m"], result["speed_mps"]
+        if (
+            all(counter.null_count() for counter in counters)
+            and (neither := counters[0].is_null() & counters[1].is_null()).any()
+        ):
             breaches.append(
                 InputError(
                     "are both empty",

@@ -102,12 +102,11 @@ def _of_offers(
     at = np.array([place.get(crossing, NOTHING) for crossing in passages["crossing_id"]], dtype=np.int64)
     of_offer = _known(at)
     of_virtual = _known(np.where(np.append(offers.virtual, False)[at], at, NOTHING))
-    columns = [
-        pl.Series("location_error_m", offers.location_error_m, nan_to_null=True).gather(of_offer),
-        _known(hazard).alias("hazard_id").gather(of_offer),
-        *(column.gather(of_virtual) for column in judged.columns()),
-        pl.Series("proof_margin_m", offers.proof_margin_m, nan_to_null=True).gather(of_virtual),
-    ]
+    location_error = pl.Series("location_error_m", offers.location_error_m, nan_to_null=True)
+    margin = pl.Series("proof_margin_m", offers.proof_margin_m, nan_to_null=True)
+    errors = pl.DataFrame([location_error, _known(hazard).alias("hazard_id")])
+    proofs = pl.DataFrame([*judged.columns(), margin])
+    columns = [*errors.select(pl.all().gather(of_offer)), *proofs.select(pl.all().gather(of_virtual))]
     return columns, np.append(inserted, False)[at]
 
 
@@ -188,6 +187,8 @@ def _with_unoffered(passages: pl.DataFrame, given: JudgeInput, crossings: Crossi
 
     `crossings`: those that belong to no passage; `stamps`: of valid positions.
     """
+    if not any(crossing.clear for left in crossings.values() for crossing in left):
+        return passages
     virtual = given.solution.balises.filter(pl.col("kind").cast(pl.String) == BaliseKind.VIRTUAL.value)
     missed = [
         (balise, crossing)
