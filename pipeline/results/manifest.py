@@ -18,6 +18,7 @@ from types import MappingProxyType
 from typing import Any, Literal, NamedTuple, TypeVar
 
 from pydantic import BaseModel, ConfigDict, TypeAdapter, ValidationError
+from pydantic_core import to_json
 
 from pipeline import storage
 from pipeline.results import packs, store
@@ -307,6 +308,7 @@ def _digested(content: bytes) -> dict[str, Any]:
 
 def _write(out: Address, manifest: Manifest) -> None:
     """Write the manifest, if it changed."""
-    content = (json.dumps(manifest, indent=1, ensure_ascii=False) + "\n").encode()
+    # What `json.dumps` writes, which takes ten times as long where it indents.
+    content = to_json(manifest, indent=1) + b"\n"
     if storage.content_of(join(out, NAME)) != content:
         storage.write_bytes(join(out, NAME), content)

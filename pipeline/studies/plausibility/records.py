@@ -41,7 +41,7 @@ class Record:
         """Whether instants lie between two rows that are no farther apart than the limit."""
         after = np.searchsorted(self.t_s, t_s, side="left")
         inside = (after < self.t_s.size) & (t_s >= self.t_s[0])
-        after = np.clip(after, 1, self.t_s.size - 1)
+        after = np.minimum(np.maximum(after, 1), self.t_s.size - 1)
         known: Bools = inside & (self.t_s[after] - self.t_s[after - 1] <= self.limit_s)
         return known
 
