@@ -107,10 +107,10 @@ def outcome_of(
     run_id: str, log: str, low: float, runs: pl.DataFrame, hazards: pl.DataFrame, passages: pl.DataFrame
 ) -> RunOutcome:
     """The outcome that a run's own tables show; below `low` availability it says what the moving time was lost to."""
-    errors = runs["error"].drop_nulls().to_list()
+    errors = [error for error in runs["error"] if error is not None]
     counted = runs.select("status", "evidence", *HAZARD_COUNTS, "missed_detections")
-    judged = known_counts(counted).drop_nulls("missed_detections")
-    *counts, missed = judged.select(pl.sum(*HAZARD_COUNTS, "missed_detections")).row(0)
+    judged = [row for row in known_counts(counted).iter_rows(named=True) if row["missed_detections"] is not None]
+    hazard_rows = sum(row[name] for row in judged for name in HAZARD_COUNTS)
     verdict = worst_verdict(runs["verdict"].to_list())
     # The solutions that have the verdict of the run.
     rows = [row for row in runs.iter_rows(named=True) if verdict is not None and row["verdict"] == verdict.value]
@@ -119,8 +119,8 @@ def outcome_of(
         status=worst_status(runs),
         error=errors[0] if errors else None,
         verdict=verdict,
-        hazards=sum(counts) if judged.height else None,
-        missed_detections=missed if judged.height else None,
+        hazards=hazard_rows if judged else None,
+        missed_detections=sum(row["missed_detections"] for row in judged) if judged else None,
         why=_verdict_reasons(rows, several=runs.height > 1),
         faults=tuple(hazard_words(hazards, passages)),
         log=redacted(log),

@@ -321,11 +321,12 @@ _MADE_FROM = "made_from"
 
 def write_campaign(out: Address, config: Configuration, made: Collection[str] = ()) -> None:
     """Derive the tables of `OUT/campaign/` from all complete runs, write the manifest; `made`: runs replayed now."""
-    key = campaign_key(out, config)
+    found = manifest.runs_found(out)
+    key = campaign_key(config, found.digests)
     if not _is_current(out, key):
         for name, content in campaign_files(store.small_tables(out), config, key):
             storage.write_bytes(join(out, name), content)
-    manifest.write_manifest(out, made)
+    manifest.write_manifest(out, made, found)
 
 
 def campaign_files(tables: Mapping[str, pl.DataFrame], config: Configuration, key: str) -> Iterator[tuple[str, bytes]]:
@@ -350,7 +351,6 @@ def _is_current(out: Address, key: str) -> bool:
     )
 
 
-def campaign_key(out: Address, config: Configuration) -> str:
+def campaign_key(config: Configuration, runs: list[tuple[str, str]]) -> str:
     """The digest of all that decides these tables: program, configuration and every marker, which names its tables."""
-    runs = [(marker.run_id, marker.sha256) for marker in store.markers(out)]
     return hashlib.sha256(repr((software_digest(), digest_of(config), runs)).encode()).hexdigest()

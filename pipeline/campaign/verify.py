@@ -19,7 +19,15 @@ from pipeline.campaign.plan import RunJob, make_plan
 from pipeline.campaign.run import campaign_files, campaign_key, run_campaign
 from pipeline.campaign.watch import Follower
 from pipeline.results import catalogue, packs, store
-from pipeline.results.manifest import NAME, Manifest, anchor, earlier_manifest, gather_manifest, read_manifest
+from pipeline.results.manifest import (
+    NAME,
+    Manifest,
+    anchor,
+    earlier_manifest,
+    gather_manifest,
+    read_manifest,
+    runs_found,
+)
 from pipeline.results.marker import sha256
 from pipeline.results.outcome import RunOutcome
 from pipeline.results.packing import not_as_marked
@@ -281,7 +289,7 @@ def _problems_of_derived(out: Address, software: set[str]) -> tuple[list[Problem
     config = store.read_config(out)
     if config is None or software != {software_digest()}:
         return problems, (NotCompared.CAMPAIGN_TABLES,)
-    for name, content in campaign_files(tables, config, campaign_key(out, config)):
+    for name, content in campaign_files(tables, config, campaign_key(config, runs_found(out).digests)):
         problems += _differences("", {name: sha256(content)}, {name: sha256(storage.content_of(join(out, name)))})
     return problems, ()
 

@@ -15,9 +15,10 @@ from functools import cache
 from importlib.metadata import PackageNotFoundError, requires, version
 from pathlib import Path
 from types import MappingProxyType
-from typing import Any, Literal, TypeVar
+from typing import Any, Literal, NamedTuple, TypeVar
 
 from pydantic import BaseModel, ConfigDict, TypeAdapter, ValidationError
+from pydantic_core import to_json
 
 from pipeline import storage
 from pipeline.results import packs, store
@@ -108,16 +109,17 @@ def note_pages(out: Address, pages: Mapping[str, bytes]) -> None:
         _write(out, manifest | {"pages": {name: _content_entry(content) for name, content in sorted(pages.items())}})
 
 
-def write_manifest(out: Address, made: Collection[str] = ()) -> None:
-    """Gather the manifest from all complete runs and write it; `made`: those that this call replayed.
+def write_manifest(out: Address, made: Collection[str] = (), found: RunsFound | None = None) -> None:
+    """Gather the manifest from all complete runs and write it; `made`: those that this call replayed; `found`: what
+    all of them say, where it was read already.
 
     A run that was changed since without being replayed keeps its entry, so that `balise verify` goes on to see it.
     """
     before = earlier_manifest(out)
-    manifest = gather_manifest(out, before)
-    for run, found in manifest["runs"].items():
+    manifest = gather_manifest(out, before, found)
+    for run, there in manifest["runs"].items():
         named = before["runs"].get(run)
-        if run not in made and _is_altered(named, found):
+        if run not in made and _is_altered(named, there):
             manifest["runs"][run] = named
     _write(out, manifest)
 
@@ -147,15 +149,32 @@ def _is_altered(named: Mapping[str, Any] | None, found: Mapping[str, Any]) -> bo
     return named["tables"] != found["tables"] and {**named, "tables": None} == {**found, "tables": None}
 
 
-def gather_manifest(out: Address, before: Manifest) -> Manifest:
-    """The manifest as the files of the result say; of the one before what no file says."""
-    runs: dict[str, Any] = {}
-    sites: dict[str, Any] = {}
+class RunsFound(NamedTuple):
+    """What the marker of each complete run says, in the form of the manifest; the files of each site by its digest."""
+
+    runs: dict[str, Any]
+    sites: dict[str, Any]
+
+    @property
+    def digests(self) -> list[tuple[str, str]]:
+        """Each run with the SHA-256 of its marker, which holds those of its other tables."""
+        return [(run, found["tables"]["runs"]) for run, found in self.runs.items()]
+
+
+def runs_found(out: Address) -> RunsFound:
+    """Read the markers of all complete runs, in the order of their ids."""
+    found = RunsFound({}, {})
     for marker in store.markers(out):
         metadata = marker.metadata
         site = metadata.get("site_digest", "").partition(" ")[0]
-        sites[site] = _file_entries(metadata.get("site_files"))
-        runs[marker.run_id] = _run_entry(metadata, marker.sha256)
+        found.sites[site] = _file_entries(metadata.get("site_files"))
+        found.runs[marker.run_id] = _run_entry(metadata, marker.sha256)
+    return found
+
+
+def gather_manifest(out: Address, before: Manifest, found: RunsFound | None = None) -> Manifest:
+    """The manifest as the files of the result say; of the one before what no file says."""
+    runs, sites = runs_found(out) if found is None else found
     used = {run["config_digest"] for run in runs.values()}
     pages = {"pages": before["pages"]} if before.get("pages") else {}
     return {
@@ -297,6 +316,7 @@ def _content_entry(content: bytes) -> dict[str, Any]:
 
 def _write(out: Address, manifest: Manifest) -> None:
     """Write the manifest, if it changed."""
-    content = (json.dumps(manifest, indent=1, ensure_ascii=False) + "\n").encode()
+    # What `json.dumps` writes, which takes ten times as long where it indents.
+    content = to_json(manifest, indent=1) + b"\n"
     if storage.content_of(join(out, NAME)) != content:
         storage.write_bytes(join(out, NAME), content)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 from collections.abc import Mapping
+from functools import lru_cache
 
 import dataframely as dy
 import numpy as np
@@ -28,7 +29,13 @@ def table_bytes(frame: pl.DataFrame, table: str, schema: type[dy.Schema], notes:
 def noted_bytes(frame: pl.DataFrame, notes: Mapping[str, str], schema: type[dy.Schema] | None = None) -> bytes:
     """A frame as Parquet with notes in the metadata of the file."""
     named = {f"{PREFIX}{key}": value for key, value in notes.items()}
-    return parquet_bytes(frame, named, None if schema is None else meanings(schema))
+    return parquet_bytes(frame, named, None if schema is None else _of_fields(schema))
+
+
+@lru_cache(maxsize=64)
+def _of_fields(schema: type[dy.Schema]) -> dict[str, pa.KeyValueMetadata]:
+    """Unit and meaning of each column of a contract, encoded once for all files."""
+    return {name: pa.KeyValueMetadata(notes) for name, notes in meanings(schema).items()}
 
 
 def notes_of(content: bytes) -> dict[str, str]:

@@ -33,7 +33,7 @@ class ParquetError(ValueError):
 def parquet_bytes(
     frame: pl.DataFrame,
     metadata: Mapping[str, str] | None = None,
-    columns: Mapping[str, Mapping[str, str]] | None = None,
+    columns: Mapping[str, pa.KeyValueMetadata] | None = None,
 ) -> bytes:
     """A frame as Parquet with its metadata; the same content always gives the same bytes.
 
@@ -41,13 +41,19 @@ def parquet_bytes(
     """
     notes = columns or {}
     group = _row_group(frame, 0)
-    fields = [field.with_metadata({**(field.metadata or {}), **notes.get(field.name, {})}) for field in group.schema]
+    fields = [_noted(field, notes.get(field.name)) for field in group.schema]
     writer = GroupedWriter(pa.schema(fields, metadata=dict(sorted((metadata or {}).items())) or None), _ROWS_PER_GROUP)
     writer.add(pa.Table.from_arrays(group.columns, schema=writer.schema))
     # A row group at a time: the table is never there twice.
     for first in range(_ROWS_PER_GROUP, frame.height, _ROWS_PER_GROUP):
         writer.add(pa.Table.from_arrays(_row_group(frame, first).columns, schema=writer.schema))
     return writer.content()
+
+
+def _noted(field: pa.Field, notes: pa.KeyValueMetadata | None) -> pa.Field:
+    """The field with notes behind what it holds."""
+    held = field.metadata
+    return field if notes is None else field.with_metadata({**held, **notes} if held else notes)
 
 
 def _row_group(frame: pl.DataFrame, first: int) -> pa.Table:

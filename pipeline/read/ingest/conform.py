@@ -32,8 +32,11 @@ def conform(frame: pl.DataFrame, stream: Stream, place: str, breaches: list[Inpu
     result = conform_to(STREAM_SCHEMAS[stream].columns(), frame, place, breaches, DEFAULTS)
     measured = [result[name] for name in ("distance_m", "speed_mps") if name in result.columns]
     if stream == "odometer" and len(measured) == 2 and all(series.null_count() for series in measured):
-        neither = measured[0].is_null() & measured[1].is_null()
-        if neither.any():
+        counters = measured[0], measured[1]
+        if (
+            all(counter.null_count() for counter in counters)
+            and (neither := counters[0].is_null() & counters[1].is_null()).any()
+        ):
             breaches.append(
                 InputError(
                     "are both empty",

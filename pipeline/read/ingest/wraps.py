@@ -117,7 +117,7 @@ def with_whole_counts(
     column: pl.Series, t_ns: Ints | None, declared: float | None, sensors: pl.Series | None, config: WrapsConfig
 ) -> UnwrappedColumn:
     """A recorded counter over its ends: as `declared`, else where it is certain. `sensors`: by row."""
-    values = column.cast(pl.Float64).fill_null(float("nan")).to_numpy().copy()
+    values = column.cast(pl.Float64).to_numpy().copy()
     found: list[Wrap] = []
     for rows in _rows_by_sensor(sensors, values.size):
         wrap = wrap_of(values[rows], None if t_ns is None else t_ns[rows], config) if declared is None else None
@@ -134,7 +134,8 @@ def _rows_by_sensor(sensors: pl.Series | None, size: int) -> Iterable[Ints]:
     """Rows of each sensor; all rows without sensors."""
     if sensors is None:
         return [np.arange(size)]
-    return [np.flatnonzero((sensors == name).to_numpy()) for name in sensors.drop_nulls().unique(maintain_order=True)]
+    names = sensors.unique(maintain_order=True).to_list()
+    return [np.flatnonzero((sensors == name).to_numpy()) for name in names if name is not None]
 
 
 _IN_MAPPING = "`{}` in its mapping"

@@ -175,7 +175,7 @@ def _part_strays(run: RunLog, few: float) -> dict[Stream, tuple[pl.DataFrame, pl
             elsewhere = _are_far_from_all(frame["t"], dated["gnss"][0]["t"])
             # Where no row is near, the clock of the whole recorder is wrong: the fit of the run names it.
             stray |= elsewhere & (not elsewhere.all())
-        dated[name] = (frame.filter(~stray) if stray.any() else frame), frame.filter(stray)
+        dated[name] = (frame.filter(~stray), frame.filter(stray)) if stray.any() else (frame, frame.clear())
     return dated
 
 
@@ -256,8 +256,7 @@ def _without_held_positions(gnss: pl.DataFrame) -> tuple[pl.DataFrame, dict[str,
     narrow = gnss.select("solution", "t", *_PLACE).with_row_index("_row")
     for part in narrow.partition_by("solution", maintain_order=True):
         t_ns = times_ns(part)
-        places = (part[name].cast(pl.Float64).fill_null(float("nan")).to_numpy() for name in _PLACE)
-        held = held_positions((t_ns - t_ns[:1]) / 1e9, *places)
+        held = held_positions((t_ns - t_ns[:1]) / 1e9, *(floats(part, name) for name in _PLACE))
         left_out[part["_row"].to_numpy()] = held
         counts[part["solution"][0]] = int(held.sum())
     return (gnss.filter(~left_out) if left_out.any() else gnss), counts
@@ -314,7 +313,7 @@ def _count_solution(part: pl.DataFrame, far: pl.DataFrame) -> StreamCounts:
     if counts.duplicates:
         elsewhere = [(pl.col(name) != pl.col(name).first().over("t")).fill_null(False) for name in _PLACE]
         contradicting = int(part.select(pl.any_horizontal(elsewhere).sum()).item())
-    far_off = far.filter(pl.col("solution") == part["solution"][0]).height
+    far_off = far.filter(pl.col("solution") == part["solution"][0]).height if far.height else 0
     return replace(counts, contradicting=contradicting, far_off=far_off)
 
 
@@ -325,7 +324,8 @@ def count_stamps(stream: Stream, frame: pl.DataFrame) -> StreamCounts:
 
 def _sort_rows(frame: pl.DataFrame, keys: list[str]) -> tuple[pl.DataFrame, StreamCounts]:
     """Rows in order of time, the first of each `keys`; counts of the duplicates and of those recorded too late."""
-    frame = frame.with_columns(pl.col("t").cast(pl.Datetime("ns", "UTC")))
+    if frame["t"].dtype != pl.Datetime("ns", "UTC"):
+        frame = frame.with_columns(pl.col("t").cast(pl.Datetime("ns", "UTC")))
     if (np.diff(times_ns(frame)) > 0).all():
         return frame, StreamCounts()
     latest = pl.col("t").cum_max()  # of the rows recorded so far

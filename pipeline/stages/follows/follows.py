@@ -12,7 +12,7 @@ import numpy as np
 import polars as pl
 
 from pipeline.stages.track.geodesy import curvature_radii_m
-from schemas.arrays import Bools, Floats, Ints, floats, median, spans_of, times_ns
+from schemas.arrays import Bools, Floats, Ints, floats, median, spans_of, times_ns, truths
 from schemas.config import Configuration, EvidenceConfig
 from schemas.enums import Fix
 from schemas.frozen import frozen
@@ -102,11 +102,11 @@ def _distances_of_sensor(odometer: pl.DataFrame, epoch_ns: int) -> tuple[Floats,
 
 def _positions_in_metres(fixes: pl.DataFrame, epoch_ns: int) -> tuple[Floats, tuple[Floats, Floats, Floats]] | None:
     """Times [s] of valid positions, and east, north, up [m] from the first of them, for differences of near ones."""
-    valid = fixes["latitude_deg"].is_finite() & fixes["longitude_deg"].is_finite() & (fixes["fix"] != Fix.NONE.value)
-    rows = np.flatnonzero(valid.fill_null(False).to_numpy())
+    degrees = np.stack([floats(fixes, "latitude_deg"), floats(fixes, "longitude_deg")])
+    rows = np.flatnonzero(np.isfinite(degrees).all(axis=0) & truths(fixes["fix"] != Fix.NONE.value))
     if rows.size < _FEWEST:
         return None
-    latitude, longitude = (np.radians(floats(fixes, f"{axis}_deg")[rows]) for axis in ("latitude", "longitude"))
+    latitude, longitude = np.radians(degrees[:, rows])
     meridian_m, normal_m = curvature_radii_m(latitude)
     north_m = _running_sum(np.diff(latitude) * meridian_m[1:])
     east_m = _running_sum(np.diff(longitude) * (normal_m * np.cos(latitude))[1:])

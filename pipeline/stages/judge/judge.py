@@ -102,12 +102,11 @@ def _offer_columns(
     at = np.array([place.get(crossing, NOTHING) for crossing in passages["crossing_id"]], dtype=np.int64)
     of_offer = _null_for_nothing(at)
     of_virtual = _null_for_nothing(np.where(np.append(offers.virtual, False)[at], at, NOTHING))
-    columns = [
-        pl.Series("location_error_m", offers.location_error_m, nan_to_null=True).gather(of_offer),
-        _null_for_nothing(hazard).alias("hazard_id").gather(of_offer),
-        *(column.gather(of_virtual) for column in judged.columns()),
-        pl.Series("proof_margin_m", offers.proof_margin_m, nan_to_null=True).gather(of_virtual),
-    ]
+    location_error = pl.Series("location_error_m", offers.location_error_m, nan_to_null=True)
+    margin = pl.Series("proof_margin_m", offers.proof_margin_m, nan_to_null=True)
+    errors = pl.DataFrame([location_error, _null_for_nothing(hazard).alias("hazard_id")])
+    proofs = pl.DataFrame([*judged.columns(), margin])
+    columns = [*errors.select(pl.all().gather(of_offer)), *proofs.select(pl.all().gather(of_virtual))]
     return columns, np.append(inserted, False)[at]
 
 
@@ -190,6 +189,8 @@ def _with_unoffered_passages(
 
     `crossings`: those that belong to no passage; `stamps`: of valid positions [ns].
     """
+    if not any(crossing.clear for left in crossings.values() for crossing in left):
+        return passages
     virtual = given.solution.balises.filter(pl.col("kind").cast(pl.String) == BaliseKind.VIRTUAL.value)
     missed = [
         (balise, crossing)

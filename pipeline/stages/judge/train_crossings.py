@@ -6,7 +6,6 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
-import polars as pl
 
 from pipeline.stages.epochs.clock import passings
 from pipeline.stages.evidence.evidence import Alternative, EvidenceSet
@@ -45,15 +44,15 @@ def crossings_of(given: JudgeInput) -> Crossings:
     Returns:
         Crossings of each balise in order of time.
     """
-    balises = given.solution.balises.unique("balise_id", keep="first")
+    rows = reversed(given.solution.balises.rows(named=True))
+    # Of a balise that is passed twice the first place stands for all: its element and measure are the same.
+    balises = {row["balise_id"]: row for row in rows}
     index = given.evidence.network.track.index
-    elements = [index.get(name, -1) for name in balises["netelement_id"]]
-    spots = zip(balises["balise_id"], elements, balises["measure_m"], strict=True)
-    places = {name: Place(element, measure_m) for name, element, measure_m in spots}
+    places = {name: Place(index.get(row["netelement_id"], -1), row["measure_m"]) for name, row in balises.items()}
     at_ns = with_instants_between(given.epochs_valid_at_ns(), given.config.align.speed_window_s)
     crossings = true_crossings(at_ns, given.evidence.at(at_ns), places, given.config)
     # `valid_direction` is along the path, `sense` of a crossing along the measure; 0 is both directions.
-    valid = dict(balises.select("balise_id", pl.col("valid_direction") * pl.col("sense")).iter_rows())
+    valid = {name: row["valid_direction"] * row["sense"] for name, row in balises.items()}
     return {
         name: [crossing for crossing in crossed if valid[name] in (0, crossing.sense)]
         for name, crossed in crossings.items()

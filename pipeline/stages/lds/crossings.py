@@ -323,11 +323,16 @@ class Disarmed:
 
 def balises_of_kind(frame: pl.DataFrame, kind: BaliseKind) -> list[Balise]:
     """The balises of one kind, in order of leg and path position."""
-    of_kind = frame.filter(pl.col("kind").cast(pl.String) == kind.value).sort("leg", "path_m", "balise_id")
-    rows = of_kind.select(
-        *("leg", "linked", "valid_direction", *PLACE), accuracy_m="location_accuracy_m", reaction="link_reaction"
-    )
-    return [Balise(kind=kind, **row | {"reaction": Reaction(row["reaction"])}) for row in rows.iter_rows(named=True)]
+    return [
+        Balise(
+            kind=kind,
+            accuracy_m=row["location_accuracy_m"],
+            reaction=Reaction(row["link_reaction"]),
+            **{name: row[name] for name in ("leg", "linked", "valid_direction", *PLACE)},
+        )
+        for row in frame.sort("leg", "path_m", "balise_id").iter_rows(named=True)
+        if row["kind"] == kind.value
+    ]
 
 
 def find_crossings(journey: Journey, balises: Sequence[Balise]) -> list[Crossing]:

@@ -11,7 +11,7 @@ from pipeline.stages.odometry.rows import step_of
 from pipeline.stages.track.geodesy import MEAN_RADIUS_M, Points, points_of
 from pipeline.stages.track.path import TravelledPath
 from pipeline.stages.track.segments import Feet, segments_at
-from schemas.arrays import Bools, Floats, Ints, floats, times_ns
+from schemas.arrays import Bools, Floats, Ints, floats, ints, times_ns
 from schemas.config import FixSigma, MatchingConfig, Vehicle
 from schemas.enums import Fix, SigmaSource
 from schemas.frozen import frozen
@@ -121,7 +121,7 @@ def _optional_floats(frame: pl.DataFrame, name: str) -> Floats:
 
 def _fix_numbers(fix: pl.Series) -> Ints:
     """Kinds of fix by their number in `Fix`; the number after the last where not known."""
-    return fix.cast(pl.Enum(_KINDS)).to_physical().cast(pl.Int64).fill_null(len(_KINDS)).to_numpy()
+    return ints(fix.cast(pl.Enum(_KINDS)).to_physical(), len(_KINDS))
 
 
 # Numerics: less than this is rounding.

@@ -194,7 +194,7 @@ def least_absolute_scale(counted: Floats, moved_m: Floats) -> Floats:
     """Per row of `counted` (lags, movements) the scale with the least sum of absolute differences: a weighted
     median.
     """
-    weight = np.nan_to_num(np.abs(counted))
+    weight = np.where(np.isnan(counted), 0.0, np.abs(counted))
     ratio = np.where(weight > 0.0, moved_m / np.where(weight > 0.0, counted, 1.0), np.inf)
     order = np.argsort(ratio, axis=1)
     sums = np.cumsum(np.take_along_axis(weight, order, axis=1), axis=1)

@@ -162,9 +162,11 @@ def _loss_conditions(epochs: JudgedEpochs, gap: Bools, config: Configuration) ->
 
 def _are_explained(alarms: pl.DataFrame, t_ns: Ints, recovery_s: float) -> Bools:
     """Epochs of alarm episodes that were due, or that belong to a hazard, and of the recovery after them."""
+    inside = np.zeros(t_ns.size, dtype=np.bool_)
+    if alarms.is_empty():
+        return inside
     due = alarms.filter((pl.col("verdict") == Verdict.TRUE.value) | pl.col("hazard_id").is_not_null())
     ends_ns = times_ns(due, "t_end") + round(recovery_s * NS_PER_S)
-    inside = np.zeros(t_ns.size, dtype=np.bool_)
     for start_ns, end_ns in zip(times_ns(due, "t_start"), ends_ns, strict=True):
         inside |= (t_ns >= start_ns) & (t_ns <= end_ns)
     return inside

@@ -363,7 +363,7 @@ def alarm_figures(alarms: pl.DataFrame, epochs: JudgedEpochs, evidence: enums.Ev
 
     The rate counts the time in use in which the along-track bank judged and the position was judged (DOMAIN 6).
     """
-    false = alarms.filter(pl.col("verdict") == enums.Verdict.FALSE).height
+    false = int((alarms["verdict"] == enums.Verdict.FALSE).sum())
     monitored: Bools = np.logical_or.reduce([epochs.verdicts[f"along_{scale}"].evaluated for scale in SCALES])
     judged_rows = epochs.judgements.is_judged
     counted_s = epochs.counted_s

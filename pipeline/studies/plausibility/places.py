@@ -19,7 +19,7 @@ from pipeline.studies.plausibility.odometer import odometer_checks, velocity_che
 from pipeline.studies.plausibility.pairs import LEAST, SIGNIFICANT_SIGMAS, explains, halves_of, steady, usual
 from pipeline.studies.plausibility.recording import Recording
 from pipeline.studies.plausibility.shifts import SurveyLine, common_lag, fit_places, fit_survey, in_words, passing_lags
-from schemas.arrays import NS_PER_S, Floats, floats, times_ns
+from schemas.arrays import NS_PER_S, Floats, Ints, floats, times_ns
 from schemas.config import FixSigma
 from schemas.enums import Fix, MisfitCause, MisfitPlace
 from schemas.run import Site
@@ -31,6 +31,8 @@ _FEWEST_IN_COMMON = 3 * LEAST
 # Degrees, minutes and seconds of an angle are written with so many decimals; finer is rounding of the computer [deg].
 _DIGITS_DEG = sorted(unit / 10.0**decimals for unit in (1.0, 1 / 60.0, 1 / 3600.0) for decimals in range(2, 10))
 _LEAST_DEG = 1e-9
+# Recorders round stamps to no more than this [ns].
+_STAMP_NS = 2_000_000
 # Positions as near to the track as this share of their sigma have no errors of their own; 0.67 is usual.
 _WITHOUT_ERROR = 0.2
 
@@ -70,14 +72,19 @@ def _at_same_stamps(of: Recording) -> tuple[Floats, Floats]:
     """Positions, and the reference's places in motion, of the same 2 ms, (n, 2) each [deg]: recorders round stamps."""
     if of.run.reference is None or of.reference is None:
         return np.zeros((0, 2)), np.zeros((0, 2))
-    stamp = pl.col("t").cast(pl.Datetime("ns", "UTC")).dt.round("2ms")
-    fixes, reference = (
-        frame.select(stamp, *_AXES).drop_nulls().unique("t", keep="first", maintain_order=True)
-        for frame in (of.fixes, of.run.reference)
-    )
-    both = reference.join(fixes, on="t", how="inner", suffix="_gnss")
-    both = both.filter(pl.Series(of.reference.moves(of.seconds(both)), dtype=pl.Boolean))
-    return both.select(f"{axis}_gnss" for axis in _AXES).to_numpy(), both.select(_AXES).to_numpy()
+    (stamps, fixes), (of_reference, references) = (_by_stamp(frame) for frame in (of.fixes, of.run.reference))
+    both_ns, here, there = np.intersect1d(stamps, of_reference, assume_unique=True, return_indices=True)
+    moves = of.reference.moves(np.asarray((both_ns - of.epoch_ns) * 1e-9, dtype=np.float64))
+    return fixes[here[moves]], references[there[moves]]
+
+
+def _by_stamp(frame: pl.DataFrame) -> tuple[Ints, Floats]:
+    """Stamps of 2 ms [ns], each once, and the first place recorded at each, (n, 2) [deg]."""
+    degrees = np.column_stack([floats(frame, axis) for axis in _AXES])
+    known = np.isfinite(degrees).all(axis=1)
+    stamps = (times_ns(frame)[known] + _STAMP_NS // 2) // _STAMP_NS * _STAMP_NS
+    each, first = np.unique(stamps, return_index=True)
+    return each, degrees[known][first]
 
 
 def _digit_deg(degrees: Floats) -> float:

@@ -8,7 +8,7 @@ import numpy as np
 import polars as pl
 
 from pipeline.stages.track.geodesy import Points, points_of
-from schemas.arrays import Bools, Floats, Ints, floats, times_ns
+from schemas.arrays import Bools, Floats, Ints, floats, times_ns, truths
 from schemas.enums import Fix
 from schemas.frozen import frozen
 
@@ -41,7 +41,7 @@ class Record:
         """Whether instants lie between two rows that are no farther apart than the limit."""
         after = np.searchsorted(self.t_s, t_s, side="left")
         inside = (after < self.t_s.size) & (t_s >= self.t_s[0])
-        after = np.clip(after, 1, self.t_s.size - 1)
+        after = np.minimum(np.maximum(after, 1), self.t_s.size - 1)
         known: Bools = inside & (self.t_s[after] - self.t_s[after - 1] <= self.limit_s)
         return known
 
@@ -96,15 +96,16 @@ class Places(Record):
 
 def places_of(frame: pl.DataFrame, epoch_ns: int) -> Places | None:
     """Valid positions of a cleaned stream; None where there are hardly any."""
-    valid = pl.col("latitude_deg").is_finite() & pl.col("longitude_deg").is_finite()
+    degrees = np.stack([floats(frame, "latitude_deg"), floats(frame, "longitude_deg")])
+    valid = np.isfinite(degrees).all(axis=0)
     if "fix" in frame.columns:
-        valid &= pl.col("fix").cast(pl.String) != Fix.NONE.value
-    frame = frame.filter(valid)
+        valid &= truths(frame["fix"].cast(pl.String) != Fix.NONE.value)
     t_s = seconds_since(epoch_ns, frame)
-    rows = _thinned(t_s)
+    valid_rows = np.flatnonzero(valid)
+    rows = valid_rows[_thinned(t_s[valid_rows])]
     if rows.size < _LEAST_ROWS:
         return None
-    points = points_of(floats(frame, "latitude_deg")[rows], floats(frame, "longitude_deg")[rows])
+    points = points_of(*degrees[:, rows])
     return Places(t_s[rows], points.surface, points, floats(frame, "height_m")[rows])
 
 
