@@ -57,7 +57,7 @@ class Alternative:
         return self.some_rows(slice(*np.searchsorted(self.rows, [first, last + 1]).tolist()))
 
     def wider_by(self, slack_m: Floats) -> Alternative:
-        """The same, wider on both sides by a length at each instant [m]; `slack_m` by instant."""
+        """The alternative, wider on both sides by a length at each instant [m]; `slack_m` by instant."""
         slack_m = slack_m[self.rows]
         return Alternative(self.rows, self.route, self.low_m - slack_m, self.high_m + slack_m)
 

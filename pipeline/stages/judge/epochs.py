@@ -149,7 +149,7 @@ def moves_and_may_move(
 
 
 def _movement_ahead(at_ns: Ints, place_m: Floats, half_m: Floats, window_s: float) -> tuple[Floats, Floats, Floats]:
-    """From each epoch to the one `window_s` later: distance [m], sum of both half intervals [m], time [s]."""
+    """Movement from each epoch to the one `window_s` later: distance [m], sum of both half intervals [m], time [s]."""
     ahead = np.searchsorted(at_ns, at_ns + round(window_s * NS_PER_S)).clip(0, at_ns.size - 1)
     return place_m[ahead] - place_m, half_m + half_m[ahead], (at_ns[ahead] - at_ns) / NS_PER_S
 
