@@ -206,7 +206,10 @@ def _judgement_codes(base: Baseline, row: Ints, moved_m: Floats, astray: Bools) 
 
 
 def _movement_by_fault_m(base: Baseline, number: Ints, measure_m: Floats, row: Ints) -> tuple[Floats, Bools]:
-    """How much further along the fault-free run's path positions lie [m]; and where they lie off that path."""
+    """How much further along the fault-free run's path positions lie [m]; and where they lie off that path.
+
+    `number`: of the net element, -1 for none; `row`: the epoch of the fault-free run.
+    """
     path = base.monitored.match.path
     near_m = floats(base.epochs, "path_m")[row]
     leg = ints(base.epochs["leg"], 0)[row]

@@ -90,7 +90,10 @@ def _refuse_wide(lines: list[str]) -> None:
 
 
 def _lines_from_header(lines: list[str]) -> list[str]:
-    """The lines from the header on; those that a logger writes above it have fewer values than the rows."""
+    """The lines from the header on; those that a logger writes above it have fewer values than the rows.
+
+    The header is the first line that has as many values as the row behind it, none of them a number.
+    """
     head = [number for number, line in enumerate(lines[:_HEAD_LINES]) if line.strip()]
     for separator in _SEPARATORS:
         counts = {number: lines[number].count(separator) for number in head}

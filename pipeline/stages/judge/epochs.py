@@ -163,7 +163,11 @@ def _steps_by_epoch(steps: Bools, size: int) -> Bools:
 def exceeds_odometer_confidence(
     t_ns: Ints, odometer_m: Floats, train_m: Floats, half_m: Floats, accepted_ns: Ints, lds: LdsConfig
 ) -> Bools:
-    """Epochs at which the distance since the last accepted VB is wrong by more than 5 m + 5 % (SUBSET-041 5.3.1.1)."""
+    """Epochs at which the distance since the last accepted VB is wrong by more than 5 m + 5 % (SUBSET-041 5.3.1.1).
+
+    `train_m` +- `half_m`: path position of the train [m], NaN where not known; the error counts where it exceeds the
+    allowance and the half intervals of both places.
+    """
     beyond = np.zeros(t_ns.size, dtype=np.bool_)
     rows = np.flatnonzero(np.isfinite(odometer_m) & np.isfinite(train_m))
     last = np.searchsorted(accepted_ns, t_ns[rows], side="right") - 1
