@@ -130,7 +130,7 @@ class MatchedEpochs:
         return self.t_ns.size
 
     def element_by(self, numbers: Mapping[str, int]) -> Ints:
-        """The matched net elements by other numbers of theirs, -1 for none."""
+        """The net element of each epoch by another numbering (name to number), -1 for none, shape (epochs,)."""
         return np.array([*(numbers.get(name, -1) for name in self.elements), -1])[self.element]
 
     @property

@@ -65,12 +65,12 @@ class BankSpec:
 
     @property
     def weights(self) -> tuple[float, ...]:
-        """Of the averages at 1 s, the raw monitor's first."""
+        """EWMA weights of the averages at 1 s, the raw monitor's (1) first."""
         return self.alphas or PUBLISHED_WEIGHTS[self.reading]
 
     @property
     def weights_text(self) -> str:
-        """As they stand in tables."""
+        """The EWMA weights as they stand in tables."""
         return ", ".join(f"{alpha:g}" for alpha in self.weights)
 
 
@@ -107,7 +107,7 @@ class LinearBank:
 
     @property
     def sigma(self) -> Floats:
-        """Of each monitor, long after the restart [m/s]."""
+        """Standard deviation of each monitor long after the restart [m/s], shape (monitors,)."""
         return np.asarray(np.sqrt(np.diag(self.covariance)[self.sources :]))
 
     @property
@@ -133,7 +133,7 @@ class LinearBank:
         return result
 
     def sigmas(self, epochs: int) -> Floats:
-        """Of each monitor at epochs 1 .. n of the fault [m/s], (epochs, monitors)."""
+        """Standard deviations of the monitors at epochs 1 .. n of the fault [m/s], shape (epochs, monitors)."""
         variances = np.diagonal(self.covariances(epochs)[1:], axis1=1, axis2=2)
         return np.asarray(np.sqrt(variances[:, self.sources :]))
 

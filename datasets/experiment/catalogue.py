@@ -139,7 +139,7 @@ def prepare_journey(plan: JourneyPlan, seed: int, rate_hz: float) -> PreparedJou
 
 
 def _motion_phases(plan: JourneyPlan) -> dict[str, object]:
-    """To speed within a minute, then steady."""
+    """Phases of a motion that reaches its speed within a minute and holds it."""
     steady_s = plan.span_s - 5.0 - SPEED_MPS / 0.5
     return {"start_m": 200.0, "phases": [{"speed_mps": SPEED_MPS, "acceleration_mps2": 0.5, "hold_s": steady_s}]}
 
@@ -262,7 +262,7 @@ def _epochs_from_onset(epochs: pl.DataFrame, prepared: PreparedJourney) -> pl.Da
 
 
 def _first_fails(epochs: pl.DataFrame, healthy: pl.DataFrame) -> dict[str, float]:
-    """By monitor the seconds to its first failure that the healthy replay does not have."""
+    """Seconds to the first failure that the healthy replay does not have, by monitor."""
     states = [f"{monitor}_state" for monitor in MONITORS]
     both = epochs.select("t", "since_s", *states).join(
         healthy.select("t", *states), on="t", how="left", suffix="_healthy", maintain_order="left"

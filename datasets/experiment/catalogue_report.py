@@ -20,7 +20,10 @@ def faults_table(runs: pl.DataFrame) -> pl.DataFrame:
 
 
 def _fault_row(runs: pl.DataFrame) -> Row:
-    """Of one fault; Pmd is over the runs whose position failed, in time means negated within budget after that."""
+    """The row of one fault.
+
+    Pmd is over the runs whose position failed, in time means negated within budget after that.
+    """
     found = runs.filter(pl.col("detected_s").is_not_null())
     failed = runs.filter(pl.col("failure_s").is_not_null())
     missed = failed.filter(~(pl.col("detected_s") <= pl.col("failure_s")).fill_null(False)).height

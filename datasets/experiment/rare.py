@@ -129,7 +129,7 @@ def missed_table(runs: int, seed: int, jobs: int, config: Configuration | None) 
     for (constellation, bank), rate in asked:
         period_s = 1.0 / bank.spec.rate_hz
         for reason, epochs, found in miss_figures(bank, rate, failure_epoch(bank, rate), period_s, runs, seed, jobs):
-            rows.append(_missed_row(constellation, bank, rate, epochs, reason) | found)
+            rows.append(_question_row(constellation, bank, rate, epochs, reason) | found)
     return table_of_rows(rows)
 
 
@@ -138,8 +138,8 @@ def _fast_banks(config: Configuration | None) -> list[_Bank]:
     return [one for one in banks(config, _FAST_HZ) if one[0] == "gps"]
 
 
-def _missed_row(constellation: Constellation, bank: LinearBank, rate: float, epochs: int, reason: str) -> Row:
-    """What was asked: a ramp of this rate [m/s] on a bank, so many epochs after its onset."""
+def _question_row(constellation: Constellation, bank: LinearBank, rate: float, epochs: int, reason: str) -> Row:
+    """The columns of a row that say what is asked: a ramp of `rate` [m/s] on a bank, so many epochs after its onset."""
     return {
         **_bank_row(constellation, bank.spec),
         "rate_mps": rate,
@@ -172,7 +172,7 @@ def transient_table(runs: int, seed: int, jobs: int, config: Configuration | Non
             for age_s in AGES_S if epochs is not None else ():
                 young = linear_bank(default_geometry(constellation), 0.0, replace(bank.spec, age_s=age_s))
                 missed = missed_detection_probability(young, epochs or 0, rate, runs, seed, jobs)
-                row = _missed_row(constellation, young, rate, epochs or 0, "transient")
+                row = _question_row(constellation, young, rate, epochs or 0, "transient")
                 rows.append({"age_s": age_s, **row, **probability_figures(missed)})
     return table_of_rows(rows)
 
@@ -240,7 +240,7 @@ class RecordedNoise:
 
     @property
     def row(self) -> Row:
-        """As a row of the table `noise`."""
+        """The noise as a row of the table `noise`."""
         return {
             "solution": self.solution,
             "runs": self.runs,
@@ -270,7 +270,10 @@ def _tables_on_recorded_noise(result: Path, runs: int, seed: int, jobs: int, con
 
 
 def recorded_noises(result: Path) -> list[RecordedNoise]:
-    """Of runs without injected faults. Raises `UsageError` where no run has a sigma and a measured white noise."""
+    """Noise measured in runs without injected faults.
+
+    Raises `UsageError` where no run has a sigma and a measured white noise.
+    """
     runs = (
         read_table(result, "runs").filter(pl.col("status") == RunStatus.OK.value, ~pl.col("faults_injected")).collect()
     )

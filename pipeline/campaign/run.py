@@ -240,7 +240,7 @@ def run_campaign(
         OutputError: results cannot be written.
         Interrupted: on SIGINT, SIGTERM and SIGHUP.
     """
-    _check_shared(plan, scheduler)
+    _refuse_unusable_plan(plan, scheduler)
     with hold_output(plan.out) as campaign:
         store.sweep(plan.out)
         known = [] if force else unchanged_outcomes(plan)
@@ -272,8 +272,11 @@ def _engine_for(jobs: int, runs: int, scheduler: str | None, limit_s: float) -> 
     return SerialEngine(limit_s) if runs <= 1 and HAS_ALARM else LocalEngine(max(1, min(jobs, runs)))
 
 
-def _check_shared(plan: Plan, scheduler: str | None) -> None:
-    """Whether a cluster can write there is found out by its workers; that nothing is to do, here."""
+def _refuse_unusable_plan(plan: Plan, scheduler: str | None) -> None:
+    """Raise `UsageError` where a plan has no run, or its result lies where no worker of the cluster can write.
+
+    Whether workers can write to any other place they find out themselves.
+    """
     if not plan.jobs:
         raise UsageError("no run is given")
     if scheduler is not None and is_url(plan.out) and plan.out.startswith("memory://"):

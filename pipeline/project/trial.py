@@ -346,7 +346,7 @@ def _check_fit(
 
 
 def _unique(said: Mapping[str, Sequence[str]]) -> list[str]:
-    """The same sentence of many runs once."""
+    """Each sentence once, behind the runs that it was said of."""
     runs: dict[str, list[str]] = {}
     for run_id, sentences in said.items():
         for sentence in sentences:

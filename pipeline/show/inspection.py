@@ -109,7 +109,7 @@ def inspect_log(
 def tables_of_log(
     log: LogDescription, config: Configuration, site: Site | None = None, vehicle: Vehicle | None = None
 ) -> dict[str, pl.DataFrame]:
-    """The same of a log that was described already."""
+    """The tables of a log that was described already, by their titles."""
     figures = {
         "kind": log.kind,
         "size_bytes": log.size_bytes,

@@ -68,7 +68,7 @@ def rate_shown(events: int, possible: int, hours: float, hours_known: float, lim
 
 
 def _compliance(low: float | None, high: float | None, limit: float) -> Compliance:
-    """Whether a limit is met, by the bounds of what was counted."""
+    """Whether a limit is met, by the lower and upper bound of what was counted; neither: not shown."""
     if high is not None and high <= limit:
         return Compliance.MET
     return Compliance.NOT_MET if low is not None and low > limit else Compliance.NOT_SHOWN

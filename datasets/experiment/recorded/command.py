@@ -421,7 +421,7 @@ def _remove_other_pieces(pieces: Sequence[_Piece], out: Path) -> None:
 
 @cache
 def _program_digest() -> str:
-    """Of the program and of what puts the faults in."""
+    """Digest of the program and of what puts the faults in."""
     digest = hashlib.sha256(software_digest().encode())
     for source in sorted(Path(__file__).parents[2].rglob("*.py")):
         digest.update(source.read_bytes())

@@ -206,7 +206,7 @@ def _judgement_codes(base: Baseline, row: Ints, moved_m: Floats, astray: Bools) 
 
 
 def _movement_by_fault_m(base: Baseline, number: Ints, measure_m: Floats, row: Ints) -> tuple[Floats, Bools]:
-    """By what positions lie further along the fault-free run's path [m]; and where they lie off that path.
+    """How much further along the fault-free run's path positions lie [m]; and where they lie off that path.
 
     `number`: of the net element, -1 for none; `row`: the epoch of the fault-free run.
     """
@@ -241,7 +241,7 @@ def _first_failures(watch: Watch) -> tuple[int | None, int | None]:
 
 
 def _is_stopped(watch: Watch, in_use: Bools, from_ns: float) -> bool:
-    """After the reaction to the first alarm a wrong position was in use no more."""
+    """Whether no wrong position was in use any more after the reaction to the first alarm."""
     return not bool((in_use & (watch.code == WRONG) & (watch.t_ns > from_ns)).any())
 
 

@@ -130,7 +130,10 @@ def _detection_figures(frame: pl.DataFrame, independent: int) -> Row:
 
 
 def _median_bounds_s(times_s: Floats, independent: int) -> tuple[float | None, float | None]:
-    """None of fewer than six passes: the least and the largest of five enclose the median with 93.75 % only."""
+    """Confidence bounds of the median by order statistics [s]; None of fewer than six passes.
+
+    The least and the largest of five enclose the median with 93.75 % only.
+    """
     from scipy.stats import binom  # takes half a second to load
 
     tail = (1.0 - CONFIDENCE) / 2.0
@@ -190,7 +193,7 @@ def _pmd_rows(injections: pl.DataFrame, bank: str, cell: Cell, plan: RecordedPla
 
 
 def _times_since_failure_s(failed: pl.DataFrame) -> Floats:
-    """From the onset, as far before the failure as it lies in the median, to where the first watch ends."""
+    """Times since the failure [s] of the Pmd curve, from the onset (by the median) to the end of the first watch."""
     failure_s = failed["time_to_failure_s"].fill_null(failed["time_to_failure_may_s"])
     before_s = float(np.median(failure_s.to_numpy()))
     after_s = float((failed["watched_s"] - failure_s).min())  # type: ignore[arg-type]

@@ -363,7 +363,10 @@ def _convert_one(log: Path, config: IngestConfig, date: date | None, solution: s
 
 
 def mappings_of_topics(config: IngestConfig, log: Path | None = None) -> IngestConfig:
-    """Without the mappings of tables, whose names are no topics of a bag; `LOG:TOPIC` of this log is its topic."""
+    """The configuration without the mappings of tables, whose names are no topics of a bag.
+
+    Of this log `LOG:TOPIC` becomes its topic.
+    """
     prefix = "" if log is None else f"{log.name}:"
     kept: dict[str, object] = {
         stream: tuple(

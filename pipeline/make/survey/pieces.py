@@ -59,7 +59,7 @@ class LinePiece:
     whole: bool = False
 
     def with_sigma(self, sigma_m: float) -> LinePiece:
-        """The same with this standard deviation [m] at points that state none."""
+        """The piece with this standard deviation [m] at points that state none."""
         return replace(self, sigma_m=np.where(np.isnan(self.sigma_m), sigma_m, self.sigma_m))
 
     def __len__(self) -> int:

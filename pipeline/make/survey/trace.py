@@ -168,7 +168,7 @@ def _densify(places: Floats) -> Floats:
 
 
 def _thin_piece(piece: LinePiece, held: Bools, shape_m: float) -> LinePiece:
-    """Without points whose leaving out moves the line by less than `shape_m`; those held stay."""
+    """The piece without points whose leaving out moves the line by less than `shape_m`; those held stay."""
     places = piece.positions_3d
     kept = held.copy()
     kept[[*range(0, len(places), _BLOCK), len(places) - 1]] = True

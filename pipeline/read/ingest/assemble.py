@@ -68,7 +68,7 @@ def _stream_frame(
 
 
 def _with_supplements(frame: pl.DataFrame, part: DecodedRows, supplements: Sequence[DecodedRows]) -> pl.DataFrame:
-    """With the columns that other messages of the same receiver hold for the same epochs."""
+    """The rows with the columns that other messages of the same receiver hold for the same epochs."""
     key = list(part.source.recipe.key)
     for supplement in supplements:
         if supplement.source.recipe.key != part.source.recipe.key or not _are_of_one_receiver(part, supplement):
@@ -186,7 +186,7 @@ def _gives_distance(frame: pl.DataFrame, silent: Sequence[str]) -> bool:
 
 
 def _without_zero_stamps(frame: pl.DataFrame, source: Source, remarks: list[str]) -> pl.DataFrame:
-    """Without the messages whose stamp is 0, as of a driver that did not know the time yet."""
+    """The messages but for those whose stamp is 0, as of a driver that did not know the time yet."""
     if source.recipe.own:
         return frame
     t_ns = frame["t"].to_physical()
@@ -209,7 +209,7 @@ def _without_zero_stamps(frame: pl.DataFrame, source: Source, remarks: list[str]
 
 
 def _with_solution(frame: pl.DataFrame, part: DecodedRows) -> pl.DataFrame:
-    """With the solution: what the messages say, else the source's."""
+    """The rows with the name of their solution: what the messages say, else the source's."""
     if part.solution is None:
         return frame
     name = pl.lit(part.solution, dtype=pl.String)

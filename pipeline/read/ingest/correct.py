@@ -59,7 +59,10 @@ def correct_further(run: RunLog, corrections: Sequence[StreamCorrection]) -> Run
 def _missing_corrections(
     run: RunLog, stream: Stream, corrections: Sequence[StreamCorrection]
 ) -> Sequence[StreamCorrection]:
-    """Those of a stream that it does not hold yet; where it holds others, nobody knows what would be made twice."""
+    """The corrections of a stream that it does not hold yet.
+
+    Where it holds others, nobody knows what would be made twice.
+    """
     held = corrections_of(run, stream)
     wanted = [correction for correction in corrections if correction.stream == stream]
     both = min(len(held), len(wanted))

@@ -90,7 +90,7 @@ def _refuse_wide(lines: list[str]) -> None:
 
 
 def _lines_from_header(lines: list[str]) -> list[str]:
-    """Without what a logger writes above the header: lines with fewer values than the rows have.
+    """The lines from the header on; those that a logger writes above it have fewer values than the rows.
 
     The header is the first line that has as many values as the row behind it, none of them a number.
     """

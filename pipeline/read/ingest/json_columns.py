@@ -110,7 +110,10 @@ class JsonDecoder:
         return columns
 
     def _parse_with_arrow(self, content: bytearray) -> pa.Table:
-        """Without the columns that the first messages lacked, as long as none has more: each costs a message time."""
+        """The messages as a table.
+
+        Columns that the first messages lacked are left out as long as no message has one: each costs a message time.
+        """
         if self._first_schema is not None:
             try:
                 return _read_with_arrow(content, self._first_schema, "error")

@@ -125,5 +125,5 @@ def _unreadable(error: ParquetError, place: str) -> InputError:
 
 
 def _is_known(column: str, stream: Stream) -> bool:
-    """Of other columns than the contract's only the names are kept."""
+    """Whether the contract knows the column; of others only the names are kept."""
     return column in dtypes(STREAM_SCHEMAS[stream])

@@ -100,7 +100,7 @@ def is_candidate(channel: Channel, config: IngestConfig) -> bool:
 
 
 def _source_by_schema(sample: Sample) -> Source | None:
-    """By the first recipe of the schema whose fields are all there, else by the first at all."""
+    """The source by the first recipe of the schema whose fields are all there, else by the first at all."""
     known = [_make_source(sample, recipe) for recipe in recipes_for(sample.channel.schema_name, sample.channel.topic)]
     return next((source for source in known if not source.breaches), known[0] if known else None)
 
@@ -278,7 +278,10 @@ def absent_topics(topics: Collection[str], config: IngestConfig, file: str) -> l
 
 
 def _preferred_sources(sources: Sequence[Source]) -> list[Source]:
-    """This project's own schema alone where it is present; a supplement only with what it adds to."""
+    """The sources to read: this project's own schema alone where it is present.
+
+    A supplement only with what it adds to.
+    """
     of_project = [source for source in sources if source.recipe.own]
     if of_project:
         return of_project

@@ -59,7 +59,7 @@ def _counts_of(recorded: Floats) -> list[float]:
 
 
 def _wrap_by_count(count: float, recorded: Floats, paused: Bools, config: WrapsConfig) -> Wrap | None:
-    """As `wrap_of`, where one count is so much of the recorded unit."""
+    """Where a counter begins anew (`wrap_of`), if one count is so much of the recorded unit."""
     counts = recorded / count
     moves = np.diff(counts)
     usual = _usual_moves(moves)

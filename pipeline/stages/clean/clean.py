@@ -202,7 +202,7 @@ def _require_times(run: RunLog, clock_advice: ClockAdvice) -> None:
 
 
 def without_undated_streams(run: RunLog) -> RunLog:
-    """The run without the streams of which no row lies within a day of a position; `notes` say so."""
+    """The run without streams whose clock is wrong: no row lies within a day of a position; `notes` say so."""
     away = [
         name
         for name in _OF_POSITIONS

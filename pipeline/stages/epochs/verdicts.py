@@ -76,7 +76,7 @@ class Verdicts:
 
     @classmethod
     def of_table(cls, table: pl.DataFrame, name: str) -> Verdicts:
-        """From the columns of the `epochs` table; what the table lacks of them is not known."""
+        """Verdicts by the columns of the `epochs` table; what the table lacks of them is not known."""
         nothing = np.full(table.height, np.nan)
         value, threshold = (
             floats(table, column) if column in table.columns else nothing

@@ -46,7 +46,7 @@ class KnownPath:
     step_m: Floats
 
     def some_rows(self, rows: slice) -> KnownPath:
-        """The same, of some samples only."""
+        """The path at some of its samples only."""
         arrays = {name: getattr(self, name)[rows] for name in ("at_m", "low_m", "high_m", "step_m")}
         return replace(self, path=self.path.some_rows(rows), **arrays)
 

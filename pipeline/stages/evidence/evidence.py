@@ -57,7 +57,7 @@ class Alternative:
         return self.some_rows(slice(*np.searchsorted(self.rows, [first, last + 1]).tolist()))
 
     def wider_by(self, slack_m: Floats) -> Alternative:
-        """The same, wider on both sides by a length at each instant [m]; `slack_m` by instant."""
+        """The alternative, wider on both sides by a length at each instant [m]; `slack_m` by instant."""
         slack_m = slack_m[self.rows]
         return Alternative(self.rows, self.route, self.low_m - slack_m, self.high_m + slack_m)
 
@@ -318,6 +318,7 @@ def combine(
     first: Sequence[Alternative], second: Sequence[Alternative], size: int, narrows: bool = True
 ) -> tuple[list[Alternative], Ints]:
     """Two sources of evidence together, and the instants at which they exclude each other."""
+    # Where they agree: the net elements common to both, with the narrower interval, or that of `first`; else all stay.
     narrowed = [_intersection(left, right) for left, right in _overlapping_pairs(first, second)]
     agreed = _have_alternative(narrowed, size)
     together = narrowed if narrows else [alternative.some_rows(agreed[alternative.rows]) for alternative in first]
@@ -335,7 +336,7 @@ def _combine_with_reads(
     left = [there.some_rows(~disputed[there.rows]) for there in alternatives]
     right = [there.some_rows(~disputed[there.rows]) for there in by_reads]
     together, _ = combine(left, right, both.size, narrows)
-    apart = both & disputed
+    apart = both & disputed  # either may be right, and one alone says nothing: as if the reference had stepped
     return together + [there.some_rows(apart[there.rows]) for there in (*alternatives, *by_reads)]
 
 

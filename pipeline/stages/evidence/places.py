@@ -27,11 +27,11 @@ class TruePlaces:
     """Largest measure there [m]."""
 
     def at(self, rows: Ints) -> TruePlaces:
-        """Those of some instants."""
+        """The places at some of the instants, by their numbers or a mask."""
         return TruePlaces(self.netelement_ids[rows], self.low_m[rows], self.high_m[rows])
 
     def columns(self) -> list[pl.Series]:
-        """As columns of `epochs`."""
+        """The places as columns of `epochs`."""
         return [
             self.netelement_ids.alias("true_netelement_ids"),
             pl.Series("true_measure_low_m", self.low_m, nan_to_null=True),

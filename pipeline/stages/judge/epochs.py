@@ -149,7 +149,7 @@ def moves_and_may_move(
 
 
 def _movement_ahead(at_ns: Ints, place_m: Floats, half_m: Floats, window_s: float) -> tuple[Floats, Floats, Floats]:
-    """From each epoch to the one `window_s` later: distance [m], sum of both half intervals [m], time [s]."""
+    """Movement from each epoch to the one `window_s` later: distance [m], sum of both half intervals [m], time [s]."""
     ahead = np.searchsorted(at_ns, at_ns + round(window_s * NS_PER_S)).clip(0, at_ns.size - 1)
     return place_m[ahead] - place_m, half_m + half_m[ahead], (at_ns[ahead] - at_ns) / NS_PER_S
 
@@ -163,7 +163,11 @@ def _steps_by_epoch(steps: Bools, size: int) -> Bools:
 def exceeds_odometer_confidence(
     t_ns: Ints, odometer_m: Floats, train_m: Floats, half_m: Floats, accepted_ns: Ints, lds: LdsConfig
 ) -> Bools:
-    """Epochs at which the distance since the last accepted VB is wrong by more than 5 m + 5 % (SUBSET-041 5.3.1.1)."""
+    """Epochs at which the distance since the last accepted VB is wrong by more than 5 m + 5 % (SUBSET-041 5.3.1.1).
+
+    `train_m` +- `half_m`: path position of the train [m], NaN where not known; the error counts where it exceeds the
+    allowance and the half intervals of both places.
+    """
     beyond = np.zeros(t_ns.size, dtype=np.bool_)
     rows = np.flatnonzero(np.isfinite(odometer_m) & np.isfinite(train_m))
     last = np.searchsorted(accepted_ns, t_ns[rows], side="right") - 1

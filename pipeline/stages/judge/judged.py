@@ -56,7 +56,7 @@ class Judgements:
         )
 
     def columns(self) -> list[pl.Series]:
-        """As columns of `epochs` and `passages`."""
+        """The judgements as columns of `epochs` and `passages`."""
         return [
             gathered(_JUDGEMENT_WORDS, self.code).alias("judgement"),
             pl.Series("error_low_m", self.low_m, nan_to_null=True),
@@ -65,7 +65,7 @@ class Judgements:
         ]
 
     def turned(self, direction: Ints) -> Judgements:
-        """The same with errors in the direction of travel (+1 along growing path, -1 against it)."""
+        """The judgements with errors in the direction of travel (+1 along growing path, -1 against it)."""
         forward = direction > 0
         low_m = np.where(forward, self.low_m, -self.high_m)
         return replace(self, low_m=low_m, high_m=np.where(forward, self.high_m, -self.low_m))

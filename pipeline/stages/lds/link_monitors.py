@@ -210,7 +210,10 @@ class Recovery:
         self._failed_at_ns = self._observed_at_ns = int(self._journey.t_ns[epoch])
 
     def is_over(self, epoch: int, evaluated: bool, failing: bool) -> bool:
-        """Whether raw and fastest monitors were silent for `recovery_s`, observed without a gap; usable now."""
+        """Whether raw and fastest monitors were silent for `recovery_s`, observed without a gap; usable now.
+
+        Observed is an epoch with a verdict of `along_raw` (`evaluated`); without an odometer, with a usable position.
+        """
         t_ns = int(self._journey.t_ns[epoch])
         usable = bool(self._journey.usable[epoch])
         observed = evaluated if self._journey.has_odometer else usable
@@ -231,7 +234,11 @@ _FIRST_BLOCK, _BLOCK = 64, 4096
 
 
 def count_out_of_order(offered: list[Crossing], overdue: int, journey: Journey, config: Configuration) -> int:
-    """Number of balises of one step that were offered out of order (what finds 1A, DIAG Hazards)."""
+    """Number of balises of one step that were offered out of order (what finds 1A, DIAG Hazards).
+
+    Two at once, or one against the direction of travel, where the odometer's step does not explain the position's;
+    `overdue` ones, whose window has closed, always.
+    """
     before = offered[0].before
     after = offered[0].epoch
     odometer_step_m = journey.odometer_m[after] - journey.odometer_m[before]

@@ -253,7 +253,7 @@ class LegsOfSteps:
     place_m: Floats
 
     def with_legs_turned(self, network: Network, legs: range) -> LegsOfSteps:
-        """The same with some legs run in the other direction."""
+        """The steps with some legs run in the other direction."""
         chains = tuple(
             chain.in_other_direction(network) if index in legs else chain for index, chain in enumerate(self.chains)
         )

@@ -127,7 +127,7 @@ class PathSet:
     last_s: float
 
     def living(self, delay_s: float) -> list[LifeSpan]:
-        """The hypotheses, each over the steps at which nothing up to `delay_s` before their end had refuted it."""
+        """Each hypothesis over the steps at which no test of steps up to `delay_s` later [s] had refuted it."""
         known = np.searchsorted(self.steps.end_s, self.steps.end_s - delay_s, side="right") - 1
         spans = []
         for node in self.nodes:

@@ -170,7 +170,10 @@ _MARGIN_SIGMAS = 10.0
 
 
 class Move(NamedTuple):
-    """The elements between two places, in order of travel, and how the first is left."""
+    """The elements between two places, in order of travel, and how the first is left.
+
+    `sense`: +1 ahead, -1 behind, 0 not at all.
+    """
 
     between: tuple[int, ...]
     sense: int

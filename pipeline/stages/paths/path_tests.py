@@ -312,7 +312,10 @@ def _limits_by_spacing(spacing: Floats, alpha: float, looks: float) -> Floats:
 
 @cache
 def _limits_and_needed(alpha: float, looks: float) -> tuple[Floats, Floats]:
-    """Limits of an offset, and how far away another track needs to be for each [sigmas]."""
+    """Limits of an offset, and how far away another track needs to be for each [sigmas].
+
+    `alpha`: level that the nine tests share; `looks`: of this test in 600 s.
+    """
     from scipy.special import ndtri
 
     share = 1.0 - ONE_TRACK_LEFT

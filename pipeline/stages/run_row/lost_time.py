@@ -57,7 +57,7 @@ class LostTime:
         return lost_words(list(self.causes), list(self.causes.values()), self.monitor, self.share)
 
     def columns(self) -> dict[str, object]:
-        """As columns of `runs`."""
+        """The lost time as columns of `runs`."""
         causes = {"lost_to": list(self.causes), "lost_to_share": list(self.causes.values())}
         return {**causes, "lost_to_monitor": self.monitor}
 
@@ -78,7 +78,7 @@ class LostColumns:
     """The first cause that applies, by number in `LostTo`; -1 for none."""
 
     def columns(self) -> list[pl.Series]:
-        """As columns of `epochs`."""
+        """What was lost at each epoch, as columns of `epochs`."""
         words = pl.Series("lost_to", [*(cause.value for cause in LostTo), None], dtype=_LOST_TO)
         return [
             pl.Series("step_s", self.step_s),

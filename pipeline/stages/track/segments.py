@@ -137,7 +137,7 @@ def nearest(points: Points, line: Polyline) -> Feet:
 def walk_to_nearest(points: Points, line: Polyline, segment: Ints, line_of: Ints | None = None) -> Feet:
     """The nearest place from a first guess, walking along the line while that gets nearer.
 
-    `fraction` is not limited.
+    `fraction` is not limited; `line_of`: per segment the line that it belongs to, where there are several.
     """
     feet = project_on_segments(points, line, segment)
     active = np.flatnonzero((feet.fraction < 0) | (feet.fraction > 1))

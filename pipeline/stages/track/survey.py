@@ -92,7 +92,10 @@ class SurveyedTrack:
         return float(self.end_m[element] - measure_m if against else measure_m - self.begin_m[element])
 
     def elements_holding(self, balises: pl.DataFrame) -> tuple[Ints, Ints]:
-        """Pairs of balise (its row) and net element on which it lies, half a metre beyond an end included."""
+        """Pairs of balise (its row) and net element on which it lies, half a metre beyond an end included.
+
+        Of an element in pieces each piece that holds the balise.
+        """
         elements = pl.DataFrame(
             {
                 "netelement_id": pl.Series(self.ids, dtype=pl.String),

@@ -85,7 +85,7 @@ def assess_claim(
 
 
 def _once_a_day(of_run: Tallies, day: tuple[object, ...], days: set[tuple[object, ...]]) -> Tallies:
-    """Without the trials of requirements that another run of the day was a trial of; time and events stay."""
+    """The tallies without trials of requirements that another run of the day was a trial of; time and events stay."""
     once = dict(of_run)
     for key, counts in of_run.items():
         if counts.trials and (*day, *key) in days:

@@ -211,7 +211,7 @@ def _with_places(
 
 
 def _without_overlaps(line: LineEvidence, placed: pl.DataFrame) -> pl.DataFrame:
-    """Without balises whose windows linking cannot tell apart, as where chains meet; the later one goes."""
+    """The balises but for the later of two whose windows linking cannot tell apart, as where chains meet."""
     while True:
         # Announced in one list, whatever their kind.
         balises = placed.select(

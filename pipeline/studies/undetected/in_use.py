@@ -52,7 +52,7 @@ class Returns:
         return cls(path_m - odometer_m, sigma_m, travelled_m, doubt_m, scale_sigma)
 
     def some_rows(self, part: slice) -> Returns:
-        """The same at some of the rows."""
+        """The returns at some of the rows."""
         return Returns(
             self.offset_m[part],
             self.sigma_m[part],

@@ -69,7 +69,7 @@ class Watched:
         return self.epoch.size
 
     def in_other_direction(self) -> Watched:
-        """The same for errors in the other direction: what bounds them behind bounds these ahead."""
+        """What bounds errors in the other direction: what bounds them behind bounds these ahead."""
         return replace(
             self,
             rate_mps=-self.rate_mps,
