@@ -198,7 +198,7 @@ def test_bounds_on_mean_and_median_times_cover() -> None:
 @pytest.fixture(scope="module")
 def published() -> pl.DataFrame:
     """The paper's grid with few repetitions."""
-    return run_diagnostics(repetitions=200, seed=11, jobs=1)["detection"]
+    return run_diagnostics(repetitions=100, seed=11, jobs=1)["detection"]
 
 
 def at(published: pl.DataFrame, reading: str, **chosen: object) -> pl.DataFrame:

@@ -173,7 +173,7 @@ def test_killed_at_any_instant_nothing_is_lost(tmp_path: Path) -> None:
     store.write_run(with_alarms("c/d", 4, availability=0.25), out, METADATA)
     store.write_run(with_alarms("b", 1), out, METADATA)
     expected = content(out)
-    for instant in range(0, 1000, 8):
+    for instant in range(0, 1000, 13):
         trial = tmp_path / f"trial{instant}"
         shutil.copytree(out, trial)
         with pytest.MonkeyPatch.context() as patch:

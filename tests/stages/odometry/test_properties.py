@@ -114,7 +114,7 @@ def test_a_journey_there_and_back_by_hand():
 @pytest.mark.parametrize("counter_m", [0.0, 0.5])
 @pytest.mark.parametrize("moving", [True, False])
 def test_the_variance_of_a_way_is_what_it_scatters_by(moving, counter_m):
-    """400 odometers whose wheel slips by 0.05 m per root second while it turns, and whose counter rounds down."""
+    """200 odometers whose wheel slips by 0.05 m per root second while it turns, and whose counter rounds down."""
     rng = np.random.default_rng(8)
     white_mps, scale, scale_sigma = 0.05, 1.002, 5e-4
     t = np.arange(0.0, 120.0, 0.1)
@@ -123,7 +123,7 @@ def test_the_variance_of_a_way_is_what_it_scatters_by(moving, counter_m):
     vehicle = Vehicle(odometer_scale=scale, odometer_scale_sigma=scale_sigma)
     standardised = []
     # One that stands has no scatter: it differs from others in where its rows begin alone.
-    for _ in range(400 if moving else 20):
+    for _ in range(200 if moving else 20):
         steps = speed * 0.1 / (scale + rng.normal(0.0, scale_sigma)) + rng.normal(0.0, 1.0, t.size) * (
             white_mps * np.sqrt(0.1) * (speed > 0.0)
         )
