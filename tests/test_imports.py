@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ast
+from functools import cache
 from pathlib import Path
 
 import pytest
@@ -30,8 +31,14 @@ def _sources() -> list[Path]:
     return [*packages, ROOT / "cli.py"]
 
 
-def _imported(source: Path, top_level_only: bool = False) -> set[str]:
-    tree = ast.parse(source.read_text(encoding="utf-8"))
+@cache
+def _tree(source: Path) -> ast.Module:
+    return ast.parse(source.read_text(encoding="utf-8"))
+
+
+@cache
+def _imported(source: Path, top_level_only: bool = False) -> frozenset[str]:
+    tree = _tree(source)
     nodes = tree.body if top_level_only else ast.walk(tree)
     names: set[str] = set()
     for node in nodes:
@@ -42,9 +49,10 @@ def _imported(source: Path, top_level_only: bool = False) -> set[str]:
             inner = {f"{node.module}.{alias.name}" for alias in node.names}
             modules = {name for name in inner if _is_module(name)}
             names |= modules if modules == inner else {node.module, *modules}
-    return names
+    return frozenset(names)
 
 
+@cache
 def _is_module(name: str) -> bool:
     path = ROOT / name.replace(".", "/")
     return path.is_dir() or path.with_suffix(".py").is_file()

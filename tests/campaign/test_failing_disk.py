@@ -28,7 +28,7 @@ from tests.campaign.disk import Disk, Killed, operations
 from tests.conftest import SmallTrial
 
 _RUNS = 2
-_MOMENTS = 10
+_MOMENTS = 6
 
 
 def content(folder: Path) -> dict[str, bytes]:

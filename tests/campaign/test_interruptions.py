@@ -45,11 +45,17 @@ def tmpfs(folder: Path, options: str) -> Iterator[Path]:
 
 
 @pytest.mark.usefixtures("in_process")
-@pytest.mark.parametrize(("signum", "status"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
-def test_stop_on_request(small_trial: SmallTrial, undisturbed: Path, tmp_path: Path, signum: int, status: int) -> None:
-    endless(tmp_path / "never.mcap")
+@pytest.mark.parametrize(
+    ("signum", "status", "jobs", "stuck"),
+    [(signal.SIGINT, 130, "2", "never"), (signal.SIGTERM, 143, "1", "run2_never")],
+)
+def test_stop_on_request(
+    small_trial: SmallTrial, undisturbed: Path, tmp_path: Path, signum: int, status: int, jobs: str, stuck: str
+) -> None:
+    """Runs are replayed in the order of their names: one worker of two, or the only one, never ends with its run."""
+    endless(tmp_path / f"{stuck}.mcap")
     out = tmp_path / "out"
-    process = start(command(small_trial, out, "--jobs", "2", runs=[tmp_path / "never.mcap", *small_trial.paths]))
+    process = start(command(small_trial, out, "--jobs", jobs, runs=[tmp_path / f"{stuck}.mcap", *small_trial.paths]))
     wait_for(lambda: len(store.run_ids(out)) >= 2)
     os.killpg(process.pid, signum) if signum == signal.SIGINT else process.send_signal(signum)
     # The run in work never ends by itself; how soon the campaign ends is measured by `make bench`.

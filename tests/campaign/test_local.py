@@ -271,7 +271,7 @@ def test_a_worker_that_dies_or_stays_while_it_starts_costs_no_attempt(
     monkeypatch.setattr("pipeline.campaign.plan._kept_sites", {**_kept_sites, ("other", SiteConfig()): large})
     if signum == signal.SIGSTOP:
         monkeypatch.setattr(WAITS, "start_s", 8.0)
-    summary = run_campaign(plan, jobs=2)
+    summary = run_campaign(plan, jobs=1)
     assert len(struck) == strikes
     assert [outcome.attempts for outcome in summary.outcomes] == [1] * 4
     assert result_bytes(tmp_path) == result_bytes(undisturbed)

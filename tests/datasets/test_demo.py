@@ -63,12 +63,12 @@ def test_its_answer_in_json_has_the_fields_of_the_page(result: DemoResult) -> No
 
 
 def test_another_seed_shows_the_same() -> None:
-    """Its files and pages are as those of the first, and need not be made."""
+    """Every other run; files and pages are as those of the first, and need not be made."""
     scenario = demo_scenario(seed=1)
     site = build_site(scenario)
     assert scenario.vehicle is not None
     checks = []
-    for spec in scenario.runs:
+    for spec in scenario.runs[::2]:
         run = build_run(scenario, spec)
         checks += compare_run(spec, run, replay(run, site, scenario.vehicle if spec.vehicle else Vehicle()))
     assert checks_table(checks).filter(~pl.col("agrees")).rows() == []

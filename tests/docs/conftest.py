@@ -4,18 +4,21 @@ from __future__ import annotations
 
 import shutil
 from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import polars as pl
 import pytest
 
+from datasets.experiment import diagnostics
 from datasets.scenario import RunSpec, Scenario, load_scenario
 from datasets.trial import build_run, build_site, write_run_log, write_site
 from pipeline.campaign import make_plan
 from pipeline.campaign.run import write_campaign
 from pipeline.campaign.worker import replay_one
 from pipeline.results.store import write_config
+from pipeline.studies.safety import sensitivity
 from schemas.config import Configuration, to_toml
 from schemas.monitors import MONITORS
 from tests.conftest import Shared
@@ -73,7 +76,13 @@ def _fill_asked(folder: Path) -> None:
 def workplace(
     workspace: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, in_process: None, replayed_once: None
 ) -> Path:
-    """A copy of the folder to work in; it is the working directory."""
+    """A copy of the folder to work in; it is the working directory.
+
+    The published Monte Carlo is run at a tenth of its size, and the verdict held against one other failure limit: what
+    they find is the subject of `experiment/test_diagnostics.py` and `studies/safety/test_sensitivity.py`.
+    """
+    monkeypatch.setattr(diagnostics, "ExperimentPlan", partial(diagnostics.ExperimentPlan, span_s=1_500, onset_s=500))
+    monkeypatch.setattr(sensitivity, "_VARIED", {"failure_limit_m": (0.5,)})
     folder = tmp_path / "work"
     shutil.copytree(workspace, folder)
     monkeypatch.chdir(folder)

@@ -159,14 +159,14 @@ def test_the_tables_by_hand() -> None:
 
 @pytest.fixture(scope="module")
 def found() -> pl.DataFrame:
-    """One run of each; the slow drifts have failed after 23 and 32 min, and the journey may end soon after that."""
+    """One run of each; the channel sees the slowest drift after 12.5 min, and the journey may end soon after that."""
     names = (
         "healthy short", "step along 1200 m", "outage of 90 s, then off by 300 m", "outage of 90 s, then off by 30 m",
-        "slip 0.8 m/s", "odometer scale 1.02", "range ramp 0.03 m/s", "one solution drifts along 0.01 m/s",
+        "slip 0.8 m/s", "odometer scale 1.02", "range ramp 0.1 m/s", "one solution drifts along 0.01 m/s",
         "step cross 10 m", "physical balise missing 2",
     )  # fmt: skip
     with pytest.MonkeyPatch.context() as patch:
-        patch.setitem(JOURNEYS, "long", JourneyPlan(2_500.0, 500.0))
+        patch.setitem(JOURNEYS, "long", JourneyPlan(1_500.0, 500.0))
         return run_catalogue(1, seed=3, faults=[FAULTS[name] for name in names])
 
 
@@ -185,7 +185,7 @@ def test_a_healthy_journey_is_quiet(found: pl.DataFrame) -> None:
         ("link_distance", "outage of 90 s, then off by 300 m"),
         ("along_doppler", "slip 0.8 m/s"),
         ("along_doppler", "odometer scale 1.02"),
-        ("pseudorange", "range ramp 0.03 m/s"),
+        ("pseudorange", "range ramp 0.1 m/s"),
         ("channel", "one solution drifts along 0.01 m/s"),
         ("cross_raw", "step cross 10 m"),
     ],
@@ -211,7 +211,7 @@ def test_what_no_monitor_sees_is_said(found: pl.DataFrame) -> None:
     page = catalogue_page(faults, monitors_table(found))
     assert "- `link_order`: among the first for step along 1200 m" in page
     assert "- `link_distance`: before all others for outage of 90 s, then off by 300 m (100.0%, alone)" in page
-    assert "range ramp 0.03 m/s (100.0%, by" in page
+    assert "range ramp 0.1 m/s (100.0%, by" in page
     section = page.split("## What no monitor sees")[1].split("##")[0]
     assert "outage of 90 s, then off by" not in section
     assert "physical balise missing 2: nothing unsafe, linking errors tell" in section
@@ -229,7 +229,7 @@ def test_a_configuration_is_judged_as_it_is() -> None:
 
 @pytest.mark.usefixtures("in_process")
 def test_it_is_written_and_does_not_depend_on_jobs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    few: tuple[CatalogueFault, ...] = (FAULTS["step along 25 m"], FAULTS["healthy short"])
+    few: tuple[CatalogueFault, ...] = (FAULTS["step along 25 m"],)
     monkeypatch.setattr(module, "catalogue", lambda: few)
     for jobs in (1, 2):
         EXPERIMENTS["catalogue"](tmp_path / str(jobs), 1, 1, jobs, None)

@@ -75,7 +75,7 @@ def naive_first(plan: ExperimentPlan, basis: np.ndarray, weights: np.ndarray, ra
 @pytest.mark.parametrize("probability", [1e-7, 1e-3])
 def test_first_passages_equal_those_of_naive_evaluation(probability: float) -> None:
     plan = small_plan(false_alarm_probability=probability)
-    paths = NoisePaths(plan, 20, random_generator(5))
+    paths = NoisePaths(plan, 10, random_generator(5))
     basis = np.concatenate([paths.advance(50).copy() for _ in range(plan.span_s // 50)])
     fast = first_passages_from(plan, basis)
     for question in range(len(plan.questions)):
@@ -198,7 +198,7 @@ def test_bounds_on_mean_and_median_times_cover() -> None:
 @pytest.fixture(scope="module")
 def published() -> pl.DataFrame:
     """The paper's grid with few repetitions."""
-    return run_diagnostics(repetitions=200, seed=11, jobs=1)["detection"]
+    return run_diagnostics(repetitions=100, seed=11, jobs=1)["detection"]
 
 
 def at(published: pl.DataFrame, reading: str, **chosen: object) -> pl.DataFrame:

@@ -91,7 +91,7 @@ def random_fault(seed):
     return {"kind": "ramp", "rate_mps": size_m / fault["duration_s"], **fault}
 
 
-@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("seed", range(2))
 def test_comparison_never_stands_on_a_fault_of_one_and_never_sees_one_of_both(seed):
     """7.5 m apart it fails, long before 20 m; what both share by the same size never parts them."""
     fault = random_fault(seed)

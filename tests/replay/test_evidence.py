@@ -259,7 +259,7 @@ def thinned(run, period_s):
     return run.with_streams(reference=reference.gather_every(round(period_s / step)))
 
 
-@pytest.mark.parametrize("period_s", [5.0, 10.0, 30.0])
+@pytest.mark.parametrize("period_s", [5.0, 30.0])
 def test_errors_are_the_same_by_a_reference_of_few_samples(period_s):
     # The train starts and brakes; a straight line over 10 s is up to 9 m off, over 30 s up to 80 m.
     run, site = journey(motion=STOPPING)

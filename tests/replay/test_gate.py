@@ -21,8 +21,8 @@ from tests.replay.journeys import QUIET, journey
 from pipeline.one_run import replay
 
 motion = {"start_m": 200.0, "phases": [{"speed_mps": 60.0}, {"stop_at_m": 8000.0}]}
-run, site = journey(gnss={"sky": {}}, motion=motion)
-fixes = journey(gnss=QUIET, motion=motion, seed=9)[0].gnss
+run, site = journey(gnss={"sky": {}, "rate_hz": 5.0}, motion=motion)
+fixes = journey(gnss={**QUIET, "rate_hz": 5.0}, motion=motion, seed=9)[0].gnss
 run = run.with_streams(
     reference=fixes.select("t", "latitude_deg", "longitude_deg", "height_m", pl.lit(0.1).alias("sigma_m")),
     gnss=pl.concat([run.gnss, run.gnss.with_columns(solution=pl.lit("second"))]),

@@ -26,8 +26,8 @@ def _shifted(run: RunLog, leap_s: float) -> RunLog:
     return run.with_streams(gnss=run.gnss.with_columns(pl.col("t") + pl.duration(milliseconds=round(1000 * leap_s))))
 
 
-@pytest.mark.parametrize("leap_s", [-3, -2, 2, 3, 16, 17, 18])
 @pytest.mark.parametrize("kept", STREAMS)
+@pytest.mark.parametrize("leap_s", [-3, 2, 17, 18])
 def test_a_clock_off_by_leap_seconds_is_unproven_and_said(kept: str, leap_s: int) -> None:
     run, site = journey()
     (row,) = replay(_shifted(run, leap_s).with_streams(**STREAMS[kept]), site, Vehicle(), WARN).runs.to_dicts()
@@ -36,7 +36,7 @@ def test_a_clock_off_by_leap_seconds_is_unproven_and_said(kept: str, leap_s: int
     assert "leap second" in row["notes"] or "GPS time" in row["notes"]
 
 
-@pytest.mark.parametrize("leap_s", [-2, 1, 3, 18])
+@pytest.mark.parametrize("leap_s", [-2, 18])
 def test_the_clock_of_an_odometer_alone_is_no_doubt_of_the_positions(leap_s: int) -> None:
     run, site = journey()
     assert run.odometer is not None

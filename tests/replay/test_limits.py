@@ -21,7 +21,7 @@ from schemas.config import Configuration, HazardConfig
 from schemas.enums import Remedy
 from schemas.limits import Limits, limits_of
 from schemas.run import RunLog, RunTables
-from tests.replay.journeys import MOTION, VEHICLE, journey
+from tests.replay.journeys import MOTION, VEHICLE, journey, replay
 from tests.stages.evidence.test_evidence import counting, seconds
 from tests.stages.run_row.test_lost_time import ALL_KNOWN, CONFIG, RUN
 from tests.studies.line.tables import alarms_of, epochs_of
@@ -110,7 +110,7 @@ def test_a_limit_moves_what_its_name_says(limit: str, changed: Changed) -> None:
     if "rows_lost_s" in world:
         run = _without_rows_between(run, *world["rows_lost_s"])
     vehicle = world.get("vehicle", VEHICLE)
-    before = one_run.replay(run, site, vehicle, Configuration())
+    before = replay(run, site, vehicle, Configuration())
     changed(limit, factor)
     assert _moved(before, one_run.replay(run, site, vehicle, Configuration())) == expected
 

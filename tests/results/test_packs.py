@@ -59,9 +59,30 @@ def written(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
+@pytest.fixture(scope="module")
+def packed(written: Path, tmp_path_factory: pytest.TempPathFactory) -> dict[int, Path]:
+    """The same in packs of so many runs; not to be changed."""
+    folders = {}
+    for runs in (3, 100):
+        folders[runs] = Path(shutil.copytree(written, tmp_path_factory.mktemp("packed") / "out"))
+        compact(folders[runs], runs_per_pack=runs)
+    return folders
+
+
 @pytest.fixture
 def out(written: Path, tmp_path: Path) -> Path:
     return Path(shutil.copytree(written, tmp_path / "out"))
+
+
+@pytest.fixture
+def in_packs(packed: dict[int, Path], tmp_path: Path) -> Path:
+    """In two packs."""
+    return Path(shutil.copytree(packed[3], tmp_path / "out"))
+
+
+@pytest.fixture
+def in_one_pack(packed: dict[int, Path], tmp_path: Path) -> Path:
+    return Path(shutil.copytree(packed[100], tmp_path / "out"))
 
 
 def content(out: Path) -> dict[str, list[tuple[object, ...]]]:
@@ -93,15 +114,13 @@ def test_every_question_has_the_same_answer(out: Path, tmp_path: Path) -> None:
         store.read_table(out, "alarms", "g")
 
 
-def test_other_programs_read_the_files_of_packs(out: Path) -> None:
-    compact(out, runs_per_pack=3)
-    read = pl.scan_parquet(out / "alarms/*/*.parquet", hive_partitioning=True, hive_schema={"run_id": pl.String})
+def test_other_programs_read_the_files_of_packs(in_packs: Path) -> None:
+    read = pl.scan_parquet(in_packs / "alarms/*/*.parquet", hive_partitioning=True, hive_schema={"run_id": pl.String})
     assert read.group_by("run_id").len().sort("run_id").collect().rows() == [("a b", 2), ("e", 3), ("f", 1)]
 
 
-def test_out_of_packs_come_the_same_bytes(out: Path) -> None:
-    before = without_copies(out)
-    compact(out, runs_per_pack=3)
+def test_out_of_packs_come_the_same_bytes(written: Path, in_packs: Path) -> None:
+    before, out = without_copies(written), in_packs
     assert not any("run_id=" in name for name in without_copies(out))
     assert {store.content_of(out, name, "e") for name in TABLES} == {
         before[f"{name}/run_id=e/{name}.parquet"] for name in TABLES
@@ -110,17 +129,17 @@ def test_out_of_packs_come_the_same_bytes(out: Path) -> None:
     assert without_copies(out) == before
 
 
-def test_runs_are_removed_from_packs(out: Path) -> None:
-    compact(out, runs_per_pack=3)
+def test_runs_are_removed_from_packs(in_packs: Path) -> None:
+    out = in_packs
     before = content(out)
     packing.remove_runs(out, ["c/d"])
     assert store.run_ids(out) == ["a b", "e", "f"]
     assert content(out) == {name: [row for row in rows if row[0] != "c/d"] for name, rows in before.items()}
 
 
-def test_own_files_count_before_packs(out: Path) -> None:
+def test_own_files_count_before_packs(in_packs: Path) -> None:
     """A run that was replayed again, and one that is new, beside packs; then packed again."""
-    compact(out, runs_per_pack=3)
+    out = in_packs
     store.write_run(with_alarms("c/d", 4, availability=0.25), out, METADATA)
     store.write_run(with_alarms("d", 1), out, METADATA)
     counts = [("a b", 2), ("c/d", 4), ("d", 1), ("e", 3), ("f", 1)]
@@ -136,11 +155,10 @@ def test_own_files_count_before_packs(out: Path) -> None:
     assert sum(pack.runs for pack in packs.read_list(out)) == 5
 
 
-def test_what_is_packed_stays_as_it_is(out: Path) -> None:
-    compact(out, runs_per_pack=2)
-    before = without_copies(out)
-    compact(out, runs_per_pack=2)
-    assert without_copies(out) == before
+def test_what_is_packed_stays_as_it_is(in_packs: Path) -> None:
+    before = without_copies(in_packs)
+    compact(in_packs, runs_per_pack=3)
+    assert without_copies(in_packs) == before
 
 
 class Killed(BaseException):
@@ -173,7 +191,7 @@ def test_killed_at_any_instant_nothing_is_lost(tmp_path: Path) -> None:
     store.write_run(with_alarms("c/d", 4, availability=0.25), out, METADATA)
     store.write_run(with_alarms("b", 1), out, METADATA)
     expected = content(out)
-    for instant in range(0, 1000, 8):
+    for instant in range(0, 1000, 13):
         trial = tmp_path / f"trial{instant}"
         shutil.copytree(out, trial)
         with pytest.MonkeyPatch.context() as patch:
@@ -227,10 +245,8 @@ def test_what_another_build_wrote_is_not_packed(out: Path, monkeypatch: pytest.M
 
 
 @pytest.mark.parametrize("place", ["list", "index", "table"])
-def test_damage_is_an_error(out: Path, place: str) -> None:
-    compact(out)
-    # What a pack holds is remembered by its place.
-    out = shutil.copytree(out, out.with_name("copy"))
+def test_damage_is_an_error(in_one_pack: Path, place: str) -> None:
+    out = in_one_pack
     (pack,) = packs.read_list(out)
     file = {"list": packs.LIST, "index": f"compact/{pack.name}.parquet", "table": f"runs/compact/{pack.name}.parquet"}
     data = bytearray((out / file[place]).read_bytes())
@@ -262,10 +278,9 @@ def list_anew(out: Path, digests: dict[str, str]) -> None:
     (out / packs.LIST).write_text(json.dumps(listed))
 
 
-def test_the_file_of_another_result_is_refused_when_it_is_read(out: Path, tmp_path: Path) -> None:
+def test_the_file_of_another_result_is_refused_when_it_is_read(in_one_pack: Path) -> None:
     """Without `verify`; whole in itself, and under the same name."""
-    compact(out)
-    out = shutil.copytree(out, tmp_path / "copy")
+    out = in_one_pack
     with_other_values(out)
     with pytest.raises(UsageError, match=r"runs/compact/.*many runs are in it: it is not the one that was packed"):
         run_sql(out, "SELECT availability FROM runs WHERE run_id = 'e'")
@@ -273,8 +288,8 @@ def test_the_file_of_another_result_is_refused_when_it_is_read(out: Path, tmp_pa
 
 
 @pytest.mark.parametrize("share", [0.0, 0.3, 0.7, 0.999])
-def test_what_was_cut_short_is_never_taken_for_whole(out: Path, tmp_path: Path, share: float) -> None:
-    compact(out)
+def test_what_was_cut_short_is_never_taken_for_whole(in_one_pack: Path, tmp_path: Path, share: float) -> None:
+    out = in_one_pack
     for number, name in enumerate(sorted(name for name in files_in(out) if "compact/" in name)):
         trial = shutil.copytree(out, tmp_path / f"cut{number}")
         whole = (trial / name).read_bytes()
@@ -285,10 +300,9 @@ def test_what_was_cut_short_is_never_taken_for_whole(out: Path, tmp_path: Path, 
             assert verify(trial).problems, name
 
 
-def test_a_changed_pack_is_not_packed_again(out: Path) -> None:
+def test_a_changed_pack_is_not_packed_again(in_one_pack: Path) -> None:
     """The new pack would be whole, and hide the change."""
-    compact(out)
-    out = shutil.copytree(out, out.with_name("copy"))
+    out = in_one_pack
     with_other_values(out)
     store.write_run(with_alarms("g", 1), out, METADATA)
     with pytest.raises(UsageError, match=r"runs/compact/.*not the one that was packed"):
@@ -322,17 +336,16 @@ def test_verify_holds_rows_of_packs_against_markers(
     assert (NotCompared.PACKS in found.not_compared) is not by_this_build
 
 
-def test_verify_sees_own_files_of_a_packed_run(out: Path) -> None:
+def test_verify_sees_own_files_of_a_packed_run(written: Path, in_one_pack: Path) -> None:
     """Without their marker nobody but `**/*.parquet` reads them."""
-    shutil.copytree(out / "alarms/run_id=e", out.with_name("e"))
-    compact(out)
+    out = in_one_pack
     assert verify(out).problems == ()
-    shutil.copytree(out.with_name("e"), out / "alarms/run_id=e")
+    shutil.copytree(written / "alarms/run_id=e", out / "alarms/run_id=e")
     assert [what for what, *_ in verify(out).problems] == ["alarms/run_id=e/alarms.parquet"]
 
 
-def test_a_list_that_names_no_table_cannot_be_read(out: Path) -> None:
-    compact(out)
+def test_a_list_that_names_no_table_cannot_be_read(in_one_pack: Path) -> None:
+    out = in_one_pack
     list_anew(out, {"index": packs.read_list(out)[0].sha256["index"]})
     with pytest.raises(UsageError, match="not the digests of all files"):
         store.run_ids(out)

@@ -54,13 +54,13 @@ def contents(folder: Path) -> dict[str, bytes]:
 
 
 def test_two_banks_on_the_same_faults(bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
-    plan = "per_cell = 2\n" + RAMPS + TWO_BANKS
+    plan = "per_cell = 1\n" + RAMPS + TWO_BANKS
     made = bench.run(plan)
     injections = made.tables["injections"]
     assert made.failed == {}
     (estimate,) = bench.said
-    assert estimate.startswith("8 injections, about ")
-    assert injections.group_by("bank").len().sort("bank")["len"].to_list() == [4, 4]
+    assert estimate.startswith("4 injections, about ")
+    assert injections.group_by("bank").len().sort("bank")["len"].to_list() == [2, 2]
     fast, deaf = (injections.filter(bank=bank).sort("injection_id") for bank in ("default", "deaf"))
     assert fast["t_onset"].equals(deaf["t_onset"])
     assert (deaf["time_to_detect_s"] > fast["time_to_detect_s"]).all()
@@ -124,11 +124,11 @@ def test_runs_that_cannot_be_used(bench: Bench, journey: Journey) -> None:
 
 
 def test_a_copy_of_a_run_is_no_further_pass(bench: Bench) -> None:
-    whole = bench.run("per_cell = 2\n" + RAMPS, "whole")
+    whole = bench.run("per_cell = 1\n" + RAMPS, "whole")
     (folder,) = (bench.folder / "runs").iterdir()
     shutil.copytree(folder, folder.with_name("zz_copy"))
     try:
-        made = bench.run("per_cell = 2\n" + RAMPS, "copied")
+        made = bench.run("per_cell = 1\n" + RAMPS, "copied")
     finally:
         shutil.rmtree(folder.with_name("zz_copy"))
     assert list(made.failed) == ["zz_copy"]

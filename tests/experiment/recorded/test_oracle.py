@@ -31,6 +31,11 @@ def _baseline(journey: Journey, config: Configuration) -> Baseline:
     return baseline_of(journey.run, journey.site, journey.vehicle, Bank("bank", config), "primary")
 
 
+@pytest.fixture(scope="module")
+def base(journey: Journey) -> Baseline:
+    return _baseline(journey, Configuration())
+
+
 def _drawn(base: Baseline, fault: PlannedFault, count: int) -> list[Onset]:
     plan = RecordedPlan(per_cell=count, faults=(fault,))
     room = room_of([base], plan.quiet_s)
@@ -61,15 +66,15 @@ def _first_alarm_s(tables: RunTables, onset: Onset, watched_s: float) -> float |
     ],
     ids=lambda fault: fault.kind.value,
 )
-def test_detects_at_the_same_epoch_as_a_replay_from_the_start(journey: Journey, fault: PlannedFault) -> None:
-    config = Configuration()
-    base = _baseline(journey, config)
+def test_detects_at_the_same_epoch_as_a_replay_from_the_start(
+    journey: Journey, base: Baseline, fault: PlannedFault
+) -> None:
     onsets = _drawn(base, fault, 1)
     assert onsets
     for onset in onsets:
         found = inject_fault(base, onset)
         row = outcome_row(base, onset, found)
-        tables = _brute_force(journey, config, found)
+        tables = _brute_force(journey, Configuration(), found)
         assert row["time_to_detect_s"] == _first_alarm_s(tables, onset, onset.cell.watch_s)
 
 

@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import sqlite3
 import struct
-import subprocess
-import sys
 from contextlib import closing
 from pathlib import Path
 
@@ -94,11 +92,6 @@ def test_heights_and_many_lines_of_well_known_binary() -> None:
     assert [part.tolist() for part in both] == [DEGREES.tolist(), DEGREES.tolist()]
     assert lines_of_wkb(struct.pack("<BI", 1, 1) + np.array([4.0, 50.0]).tobytes())[0].tolist() == [[4.0, 50.0]]
     assert lines_of_wkb(struct.pack("<BII", 1, 3, 0)) == []
-
-
-def test_a_replay_loads_no_map_library() -> None:
-    code = "import sys, pipeline.one_run, pipeline.read.site.read, cli; assert 'pyogrio' not in sys.modules"
-    subprocess.run([sys.executable, "-c", code], check=True)
 
 
 def test_layers_that_a_map_only_declares_are_refused(tmp_path: Path) -> None:

@@ -71,7 +71,7 @@ def at_once(contents: list[bytes], decoder: JsonDecoder | None = None) -> tuple[
     return columns, decoder.slow_messages
 
 
-@settings(max_examples=150, deadline=None, derandomize=True)
+@settings(max_examples=100, deadline=None, derandomize=True)
 @given(payloads)
 def test_what_is_taken_at_once_is_what_the_parser_says(drawn):
     for content in (written(*one) for one in drawn):
@@ -98,7 +98,7 @@ alike = st.fixed_dictionaries(
 ALIKE = b'{"a":0.5,"t":{"sec":7},"name":"x","ok":true}'
 
 
-@settings(max_examples=300, deadline=None, derandomize=True)
+@settings(max_examples=200, deadline=None, derandomize=True)
 @given(st.lists(st.tuples(alike, styles, damage), min_size=1, max_size=4))
 def test_messages_that_hold_the_same_fields_are_what_the_parser_says(drawn):
     contents = [ALIKE, *(written(*one) for one in drawn)]

@@ -21,7 +21,7 @@ from tests.read.ingest import oracle, samples
 from tests.read.ingest.samples import DEFINITIONS
 
 SETTINGS = settings(
-    max_examples=25, deadline=None, derandomize=True,
+    max_examples=18, deadline=None, derandomize=True,
     suppress_health_check=[HealthCheck.function_scoped_fixture, HealthCheck.too_slow],
 )  # fmt: skip
 

@@ -48,7 +48,7 @@ def test_threshold_factor_is_the_two_sided_quantile():
     assert threshold_factor(1e-7) == pytest.approx(5.3267, abs=5e-5)
 
 
-@pytest.mark.parametrize("seed", range(8))
+@pytest.mark.parametrize("seed", range(5))
 def test_a_clean_run_without_vehicle_file_raises_no_alarm_and_finds_the_scale(seed):
     aligned = align_run(*run(REAL, seed), Vehicle(), CONFIG)
     assert alarms(aligned) == []
@@ -64,7 +64,7 @@ def test_constant_speed_tells_no_latency_and_the_filter_knows_it():
     cruising = Straight(duration_s=900.0, latency_s=0.1, cruise_s=2000.0)
     found = pl.concat(
         align_run(*run(cruising, seed), Vehicle(), CONFIG).select("latency_s", "latency_sigma_s")[-1]
-        for seed in range(12)
+        for seed in range(8)
     )
     away = (found["latency_s"] - 0.1) / found["latency_sigma_s"]
     assert float((away**2).mean() ** 0.5) < 1.5
@@ -87,10 +87,10 @@ def test_what_the_vehicle_file_gives_alone_stays_and_the_other_is_learned(known,
 
 def test_braking_after_a_long_cruise_raises_no_alarm():
     plan = Straight(duration_s=1900.0, period_s=1.0, latency_s=0.25, cruise_s=1800.0)
-    assert [seed for seed in range(10) if alarms(align_run(*run(plan, seed), Vehicle(), CONFIG))] == []
+    assert [seed for seed in range(6) if alarms(align_run(*run(plan, seed), Vehicle(), CONFIG))] == []
 
 
-@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("seed", range(2))
 @pytest.mark.parametrize("rate_mps", [0.5, -0.5])
 def test_a_drift_after_five_kilometres_is_detected_before_the_position_failure(seed, rate_mps):
     begin_s = 200.0

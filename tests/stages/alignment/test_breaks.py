@@ -25,7 +25,7 @@ from tests.stages.alignment.straight import (
 
 CONFIG = Configuration()
 REAL = Straight(duration_s=900.0, period_s=1.0, scale=1.004, latency_s=0.08)
-SEEDS = range(10)
+SEEDS = range(7)
 LEARNED = ("odometer_scale", "scale_sigma", "latency_s", "latency_sigma_s")
 
 

@@ -50,7 +50,7 @@ def test_reads_near_both_ends_prove_a_run() -> None:
     assert rungs["balise"].row["verdict"] == "safe", (rungs["balise"].row["share_unknown"], journey.ride.track_m.max())
 
 
-@pytest.mark.parametrize("scale", [1.0, 1.004, 0.992])
+@pytest.mark.parametrize("scale", [1.0, 0.992])
 def test_without_a_vehicle_file(scale: float) -> None:
     """The reference needs no vehicle file; with reads 0.8 % of scale leave 16 m over 2 km."""
     world = replace(World(GROUNDS["curved_chain"], LEGS), vehicle=None, counter=Counter(scale=scale))
@@ -74,7 +74,7 @@ def test_without_an_odometer() -> None:
     assert {rung.row["vehicle"] for rung in rungs.values()} == {"none"}
 
 
-@pytest.mark.parametrize("sigma_m", [0.05, 0.3, 1.0])
+@pytest.mark.parametrize("sigma_m", [0.05, 1.0])
 def test_with_a_worse_reference(sigma_m: float) -> None:
     journey, rungs = _rungs(replace(World(GROUNDS["straight"], LEGS), better=Better(sigma_m=sigma_m)), 15, "reference")
     assert findings(journey, rungs) == []

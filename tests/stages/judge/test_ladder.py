@@ -13,7 +13,7 @@ from tests.stages.judge.ride import Leg
 from tests.stages.judge.sensors import Better, Counter, Receiver, seconds
 from tests.stages.judge.world import World, make_journey
 
-SEEDS_EACH = 8
+SEEDS_EACH = 5
 FIRST_SEEDS = (0, 400)
 
 

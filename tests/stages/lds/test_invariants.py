@@ -58,7 +58,7 @@ class Chaos:
 
 
 @given(seed=st.integers(0, 100_000))
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=20, deadline=None)
 def test_rows_contradict_neither_each_other_nor_the_epochs(seed: int) -> None:
     result = Chaos(seed).replayed()
     epochs = result.epochs
@@ -84,7 +84,7 @@ def test_rows_contradict_neither_each_other_nor_the_epochs(seed: int) -> None:
 
 
 @given(seed=st.integers(0, 100_000))
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=20, deadline=None)
 def test_a_row_for_each_crossing_that_no_latch_held(seed: int) -> None:
     """Far from any latch: balises at least 60 m apart and no re-crossing within 60 m of odometer."""
     chaos = Chaos(seed)
@@ -109,7 +109,7 @@ def test_a_row_for_each_crossing_that_no_latch_held(seed: int) -> None:
 
 
 @given(seed=st.integers(0, 100_000), shift_s=st.integers(1, 10**6))
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=20, deadline=None)
 def test_a_constant_added_to_all_times_changes_nothing_else(seed: int, shift_s: int) -> None:
     chaos = Chaos(seed)
     here, later = chaos.replayed(), chaos.replayed(shift_s)
@@ -120,7 +120,7 @@ def test_a_constant_added_to_all_times_changes_nothing_else(seed: int, shift_s: 
 
 
 @given(seed=st.integers(0, 100_000))
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=20, deadline=None)
 def test_what_comes_later_changes_no_decision_before(seed: int) -> None:
     """A run cut short gives the same decisions up to the cut (labels of unfinished passages aside)."""
     chaos = Chaos(seed)
@@ -135,7 +135,7 @@ def test_what_comes_later_changes_no_decision_before(seed: int) -> None:
 
 
 @given(seed=st.integers(0, 100_000))
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=20, deadline=None)
 def test_uneventful_stretches_are_what_single_steps_make_of_them(seed: int) -> None:
     chaos = Chaos(seed)
     at_once = chaos.replayed()

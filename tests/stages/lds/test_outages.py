@@ -28,7 +28,7 @@ def accepted_after(made: Journey, lds: LdsResult) -> int:
 
 
 @pytest.mark.parametrize("gap_s", [5, 40, 90, 300])
-@pytest.mark.parametrize("seed", [1, 2, 3])
+@pytest.mark.parametrize("seed", [1, 2])
 def test_an_offset_that_comes_out_of_an_outage_is_never_accepted(seed: int, gap_s: int) -> None:
     made = tunnel(seed, gap_s, 0.0)
     _, healthy = lds_of(made, CONFIG)
@@ -52,14 +52,14 @@ def test_without_a_vehicle_file_a_long_outage_ends_the_use_of_the_position(gap_s
 
 
 def test_slow_drifts_after_a_return() -> None:
-    """16 random drifts (six without re-link: none is in use again): after a return none is in use beyond 20 m."""
+    """10 random drifts (three without re-link: none is in use again): after a return none is in use beyond 20 m."""
 
     def outcomes(config: LdsConfig, drifts: int) -> list[Outcome]:
         return [outcome(ramp(seed, 1.0 + seed % 2), Configuration(lds=config)) for seed in range(drifts)]
 
-    assert not any(one.returned for one in outcomes(LdsConfig(relink=False), 6))
-    by_rule = outcomes(LdsConfig(), 16)
-    assert sum(one.negated for one in by_rule) >= 12
+    assert not any(one.returned for one in outcomes(LdsConfig(relink=False), 3))
+    by_rule = outcomes(LdsConfig(), 10)
+    assert sum(one.negated for one in by_rule) >= 8
     assert any(one.returned for one in by_rule)
     assert max(one.beyond_s for one in by_rule) == 0.0
 

@@ -120,7 +120,7 @@ def test_a_step_in_doubt_is_not_compared() -> None:
     assert found.scale == pytest.approx(1.0, abs=1e-6)
 
 
-@settings(max_examples=60, deadline=None, derandomize=True)
+@settings(max_examples=40, deadline=None, derandomize=True)
 @given(seed=st.integers(0, 10**6))
 def test_no_figure_is_wrong_by_more_than_four_of_its_sigmas(seed: int) -> None:
     """Constant speed, shuttles, freight, trams; `benchmarks.truth.clock` draws ten thousand."""
@@ -175,10 +175,10 @@ def test_a_slip_widens_what_is_possible() -> None:
 
 
 def test_the_true_lag_is_hardly_ever_refuted() -> None:
-    """White places of 1 m, 1,000 draws of 3 to 11 ways: at 3 sigmas 1 in 370 of a normal figure."""
+    """White places of 1 m, 400 draws of 3 to 11 ways: at 3 sigmas 1 in 370 of a normal figure."""
     dice = np.random.default_rng(7)
     missed = 0
-    for _ in range(1000):
+    for _ in range(400):
         count, late_s, scale = (
             int(dice.integers(3, 12)),
             float(dice.uniform(-3.0, 3.0)),
@@ -188,4 +188,4 @@ def test_the_true_lag_is_hardly_ever_refuted() -> None:
         noisy = scale * travelled_m + np.diff(dice.normal(0.0, 1.0, count + 1))
         found = possible_lags((begin_s, end_s, noisy), counter(), np.full(count, 2.0), 0.05, 3.0)
         missed += found is not None and not found[0] <= late_s <= found[1]
-    assert missed <= 3
+    assert missed <= 1

@@ -62,7 +62,7 @@ def test_nothing_is_reported_of_healthy_trips(trips: list[Trip]) -> None:
         assert [check.sentence for check in found.misfits] == []
 
 
-@pytest.mark.parametrize("seed", range(10_000, 10_012))
+@pytest.mark.parametrize("seed", range(10_000, 10_008))
 def test_a_faulty_run_does_not_fail(seed: int) -> None:
     drawn = trip(seed)
     found = fit_of(drawn.run, drawn.site)

@@ -139,13 +139,21 @@ def test_without_a_hold_growth_counts_from_the_return() -> None:
     assert found[40] == pytest.approx(AT_FIX_M + bound_m(30) + THRESHOLD_MPS * (10 + 9 + 4), rel=1e-4)
 
 
-@pytest.mark.parametrize("step_m", [6.0, -6.0])
-def test_a_noticed_fault_that_returns_stays_within_the_bound(step_m: float) -> None:
-    """A step of 6 m, found at once and back after 30 s, for it is within the bound of the re-link; later a drift."""
-    t_s = np.arange(1_600.0)
-    fault_m = np.where(t_s >= 150, step_m, 0.0) + np.sign(step_m) * 0.005 * np.maximum(t_s - 300.0, 0.0)
+RETURNING_S = np.arange(1_600.0)
+
+
+@pytest.fixture(scope="module")
+def bounds() -> pl.DataFrame:
+    """Those of a run without a fault."""
     computed = Configuration(undetected=UndetectedConfig(compute=True, fixes=("reference",)))
-    bounds = _replayed(np.zeros(t_s.size), t_s, computed)
+    return _replayed(np.zeros(RETURNING_S.size), RETURNING_S, computed)
+
+
+@pytest.mark.parametrize("step_m", [6.0, -6.0])
+def test_a_noticed_fault_that_returns_stays_within_the_bound(bounds: pl.DataFrame, step_m: float) -> None:
+    """A step of 6 m, found at once and back after 30 s, for it is within the bound of the re-link; later a drift."""
+    t_s = RETURNING_S
+    fault_m = np.where(t_s >= 150, step_m, 0.0) + np.sign(step_m) * 0.005 * np.maximum(t_s - 300.0, 0.0)
     epochs = _replayed(fault_m, t_s, Configuration())
     used = (epochs["lds_mode"] != "fail_safe").to_numpy() & epochs["withheld_for"].is_null().to_numpy()
     name = "ahead" if step_m > 0 else "behind"
