@@ -27,7 +27,6 @@ from pipeline.campaign.waits import WAITS
 from pipeline.campaign.watch import Follower
 from pipeline.campaign.worker import fail_run
 from pipeline.results import manifest, store
-from pipeline.results.figures.campaign_figures import derived_tables
 from pipeline.results.manifest import note_settings
 from pipeline.results.marker import metadata_of, sha256
 from pipeline.results.outcome import CampaignSummary, RunOutcome
@@ -334,6 +333,8 @@ def write_campaign(out: Address, config: Configuration, made: Collection[str] = 
 
 def campaign_files(tables: Mapping[str, pl.DataFrame], config: Configuration, key: str) -> Iterator[tuple[str, bytes]]:
     """Name and content of each of these tables, from the small tables of all runs."""
+    from pipeline.results.figures.campaign_figures import derived_tables  # statistics, which take long to load
+
     derived = derived_tables(tables["runs"], tables["hazards"], tables["passages"], tables["alarms"], config)
     made = {"software": SOFTWARE, "config_digest": digest_of(config), _MADE_FROM: key}
     for name, table in derived.items():

@@ -321,20 +321,6 @@ class Disarmed:
         return odometer_m - at_m
 
 
-def balises_of_kind(frame: pl.DataFrame, kind: BaliseKind) -> list[Balise]:
-    """The balises of one kind, in order of leg and path position."""
-    return [
-        Balise(
-            kind=kind,
-            accuracy_m=row["location_accuracy_m"],
-            reaction=Reaction(row["link_reaction"]),
-            **{name: row[name] for name in ("leg", "linked", "valid_direction", *PLACE)},
-        )
-        for row in frame.sort("leg", "path_m", "balise_id").iter_rows(named=True)
-        if row["kind"] == kind.value
-    ]
-
-
 def find_crossings(journey: Journey, balises: Sequence[Balise]) -> list[Crossing]:
     """Crossings of virtual balises by the position, leg by leg; those of one step in the order of being passed."""
     known = np.flatnonzero(journey.positioned)

@@ -11,11 +11,11 @@ from pipeline.stages.epochs.clock import passings
 from pipeline.stages.epochs.verdicts import Verdicts
 from pipeline.stages.lds.crossings import (
     PLACE,
+    Balise,
     Crossing,
     Journey,
     Passage,
     arrays_of_crossings,
-    balises_of_kind,
     find_crossings,
     in_order_of_time,
     telegrams_on_path,
@@ -27,7 +27,7 @@ from pipeline.stages.monitors.bank import MonitorBank
 from schemas.arrays import Bools, Floats, Ints
 from schemas.config import Configuration, LdsConfig
 from schemas.conform import dtypes
-from schemas.enums import BaliseKind, Cause, Direction, FailureMode, LdsMode, LostTo
+from schemas.enums import BaliseKind, Cause, Direction, FailureMode, LdsMode, LostTo, Reaction
 from schemas.frozen import frozen
 from schemas.stages import AlignedEpochs, Crossings, LdsEpochs
 from schemas.tables import Passages
@@ -91,6 +91,20 @@ def run_lds(
         unknown_reads=unknown,
         held=tuple(system.held),
     )
+
+
+def balises_of_kind(frame: pl.DataFrame, kind: BaliseKind) -> list[Balise]:
+    """The balises of one kind, in order of leg and path position."""
+    return [
+        Balise(
+            kind=kind,
+            accuracy_m=row["location_accuracy_m"],
+            reaction=Reaction(row["link_reaction"]),
+            **{name: row[name] for name in ("leg", "linked", "valid_direction", *PLACE)},
+        )
+        for row in frame.sort("leg", "path_m", "balise_id").iter_rows(named=True)
+        if row["kind"] == kind.value
+    ]
 
 
 def _lds_epochs(system: LocationSystem, journey: Journey, config: LdsConfig) -> LdsEpochs:

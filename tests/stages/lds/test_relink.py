@@ -8,8 +8,9 @@ from typing import Any
 
 import pytest
 
-from pipeline.stages.lds.crossings import Journey, balises_of_kind, telegrams_on_path
+from pipeline.stages.lds.crossings import Journey, telegrams_on_path
 from pipeline.stages.lds.link_monitors import Relink
+from pipeline.stages.lds.run import balises_of_kind
 from pipeline.stages.odometry.bound import LOST_M
 from schemas.enums import BaliseKind, NotEvaluated
 from schemas.stages import AlignedEpochs
