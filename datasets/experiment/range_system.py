@@ -165,7 +165,7 @@ class RangeSystem:
 
 
 def range_system(plan: RangePlan, heading_deg: float) -> RangeSystem:
-    """The monitor of a plan at a heading, as `statistic` has it."""
+    """The monitor of a plan at a heading, as `monitor_statistic` has it."""
     one = monitor_statistic(plan, heading_deg)
     scaled = one.project[:, None, :] * np.sqrt(plan.geometry.range_variance_m2).T[None]
     covariance = np.einsum("asn,bsn->sab", scaled, scaled)

@@ -1,6 +1,6 @@
 """Vehicle and noise of each run from other runs of the same vehicle (`balise replay --calibrate`).
 
-A run is measured once (`calibration.observe`), whoever uses it; a run never calibrates itself. Order and
+A run is measured once (`calibration.observe_run`), whoever uses it; a run never calibrates itself. Order and
 number of processes change nothing.
 """
 

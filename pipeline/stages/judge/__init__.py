@@ -5,9 +5,9 @@ tables. Touches no file. Velocity, and scale and latency learned in the run, dec
 
 - One epoch, from position to judgement: `judge.judge`, `epochs.judged_epochs`, `judgement.judge_positions`.
 - One crossing, from offer to `unsafe_accepted`: `epochs.judged_offers`, `judge.passages_table`, and in `run_row`
-  `run_figures.acceptances`.
-- One failure, from onset to `within_budget`: `failures.error_history_of`, `failures.find_failures`,
-  `failures.within_budget`.
+  `run_figures.acceptance_conditions`.
+- One failure, from onset to `within_budget`: `failures.error_history`, `failures.find_failures`,
+  `failures.keeps_budget`.
 
 | question | module |
 |---|---|

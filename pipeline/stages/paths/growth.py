@@ -33,9 +33,9 @@ def path_set(
         search: the places within reach, where many stretches share them; None: looked for here.
 
     Returns:
-        The set, whose `living` gives the paths of each step by what was known then, `to_the_end` in hindsight, both
-        with the least p-value of each path, and `elements` the same by net element. Empty without a position near the
-        network.
+        The set, whose `living` gives the paths of each step by what was known then, `surviving_spans` in
+        hindsight, both with the least p-value of each path, and `elements_by_step` the same by net element.
+        Empty without a position near the network.
 
     Source:
         DOMAIN section 2, rules 1 to 7 (Neyman 1937).

@@ -120,7 +120,7 @@ class SurveyedTrack:
         return int(self.first[element]) if position == 0 else int(self.first[element + 1]) - 1
 
     def element_at(self, name: str, measure_m: float) -> int | None:
-        """The net element of a name if it holds the measure, as `holding` has it; none where it does not."""
+        """The net element of a name if it holds the measure, as `elements_holding` has it; none where it does not."""
         if (element := self.index.get(name)) is None:
             return None
         low_m = float(self.begin_m[element])
