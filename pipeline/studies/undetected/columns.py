@@ -87,7 +87,7 @@ def unnoticed_of(monitored: MonitoredSolution) -> Undetected:
 def _nothing(table: type[dy.Schema], rows: int) -> pl.DataFrame:
     """The columns of a table that are computed here, null in every row."""
     kinds = {name: kind for name, kind in dtypes(table).items() if name.startswith(("undetected_", "physical_"))}
-    return pl.DataFrame([pl.Series(name, [None], dtype=kind).new_from_index(0, rows) for name, kind in kinds.items()])
+    return pl.DataFrame(schema=kinds).clear(rows)
 
 
 def _gathered(at_rows: pl.DataFrame, at: Ints) -> pl.DataFrame:
