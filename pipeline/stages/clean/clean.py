@@ -221,6 +221,8 @@ def _part_sensors(odometer: pl.DataFrame, used: str, run_id: str) -> tuple[pl.Da
     """The odometer that the LDS uses, and the others in the order of their names."""
     if "sensor" not in odometer.columns:
         return odometer, ()
+    if odometer.height and (odometer["sensor"] == used).all():
+        return odometer, ()
     sensors = {str(key[0]): part for key, part in odometer.partition_by("sensor", as_dict=True).items()}
     if odometer.height and used not in sensors:
         raise InputError(

@@ -101,8 +101,8 @@ def fixes_of(frame: pl.DataFrame, sigma: FixSigma) -> Fixes:
 
 def count_contradictory_covariances(frame: pl.DataFrame) -> int:
     """How many epochs of a `gnss` stream have a `cov_en_m2` that no covariance with these variances can have."""
-    ee, en, nn = (pl.col(f"cov_{axes}_m2") for axes in ("ee", "en", "nn"))
-    return frame.filter((ee > 0) & (nn > 0) & (en**2 >= ee * nn)).height
+    ee, en, nn = (floats(frame, f"cov_{axes}_m2") for axes in ("ee", "en", "nn"))
+    return int(((ee > 0.0) & (nn > 0.0) & (en**2 >= ee * nn)).sum())
 
 
 _KINDS = [kind.value for kind in Fix]

@@ -39,7 +39,7 @@ from pipeline.stages.run_row.run_figures import (
     time_in_use,
     verdict_of,
 )
-from schemas.arrays import NS_PER_S, times_ns
+from schemas.arrays import NS_PER_S, ints, times_ns, truths
 from schemas.config import Configuration
 from schemas.conform import dtypes
 from schemas.enums import (
@@ -157,10 +157,10 @@ def judgement_notes(run: Mapping[str, Any]) -> list[Remark]:
 
 def undiagnosed_notes(epochs: JudgedEpochs, passages: pl.DataFrame) -> list[Remark]:
     """Notes on virtual balises that were accepted while no odometer could contradict the position."""
-    accepted = (pl.col("kind") == BaliseKind.VIRTUAL.value) & (pl.col("status") == PassageStatus.ACCEPTED.value)
-    offers = passages.filter(accepted).drop_nulls("t_offered")
+    virtual = truths(passages["kind"] == BaliseKind.VIRTUAL.value)
+    accepted = virtual & truths(passages["status"] == PassageStatus.ACCEPTED.value)
     # The first epoch at or after each offer.
-    epoch = np.searchsorted(epochs.t_ns, times_ns(offers, "t_offered"))
+    epoch = np.searchsorted(epochs.t_ns, ints(passages["t_offered"].cast(pl.Int64))[accepted])
     reasons = epochs.verdicts["along_raw"].reason[epoch[epoch < epochs.height]]
     counts = {reason: int((reasons == NUMBER[reason]).sum()) for reason in _WITHOUT_ODOMETER}
     return [Remark(Note.UNDIAGNOSED, (count, reason.value)) for reason, count in counts.items() if count]

@@ -95,7 +95,7 @@ def largest_unnoticed(monitored: MonitoredSolution) -> Undetected:
 def _null_columns(table: type[dy.Schema], rows: int) -> pl.DataFrame:
     """The columns of a table that are computed here, null in every row."""
     kinds = {name: kind for name, kind in dtypes(table).items() if name.startswith(("undetected_", "physical_"))}
-    return pl.DataFrame([pl.Series(name, [None], dtype=kind).new_from_index(0, rows) for name, kind in kinds.items()])
+    return pl.DataFrame(schema=kinds).clear(rows)
 
 
 def _gather_columns(at_rows: pl.DataFrame, at: Ints) -> pl.DataFrame:
