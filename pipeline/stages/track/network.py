@@ -108,7 +108,7 @@ class Network:
     def unsearched(self) -> Network:
         """The same network without the results of searches: no run's answers may depend on runs before it."""
         self.chords  # noqa: B018  one for all copies: what it knows of a chain does not depend on who asked
-        self.unbranched  # noqa: B018  one for all copies too: it is a property of the network
+        self.line_of_element  # noqa: B018  one for all copies too: it is a property of the network
         again = copy.copy(self)
         again._known = {}
         return again
