@@ -13,15 +13,16 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from multiprocessing.context import ForkServerContext, ForkServerProcess
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-import polars as pl
 import pytest
 from hypothesis import HealthCheck, settings
 
-from datasets.demo import demo_scenario
-from datasets.trial import build_run, build_site, write_run_log, write_site
-from schemas.run import RunLog, RunTables
+if TYPE_CHECKING:
+    from schemas.run import RunLog, RunTables
+
+# The process that hands out the tests loads this file before it starts the others, and needs nothing of the program:
+# polars and what builds a trial are imported where they are used.
 
 # The same examples every time, on a slow machine too.
 settings.register_profile(
@@ -218,6 +219,10 @@ class SmallTrial:
 
 def cut(run: RunLog, run_id: str, begin_s: int, length_s: int = _LENGTH_S) -> RunLog:
     """The part of a run from `begin_s` after its start."""
+    import polars as pl
+
+    from schemas.run import RunLog
+
     start = run.gnss["t"].min() + pl.duration(seconds=begin_s)  # type: ignore[operator]
     inside = pl.col("t").is_between(start, start + pl.duration(seconds=length_s))
     odometer = run.odometer.filter(inside) if run.odometer is not None else None
@@ -254,6 +259,9 @@ def small_trial(shared: Shared) -> SmallTrial:
 
 
 def _write_small_trial(folder: Path) -> None:
+    from datasets.demo import demo_scenario
+    from datasets.trial import build_run, build_site, write_run_log, write_site
+
     scenario = demo_scenario()
     spec = next(run for run in scenario.runs if run.id == "outage")
     run = build_run(scenario, spec)

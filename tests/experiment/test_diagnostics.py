@@ -115,14 +115,14 @@ def test_failure_is_the_first_epoch_beyond_the_limit() -> None:
 def test_vector_processes_equal_satellite_processes_in_law() -> None:
     """Covariances over a lag: simulated basis against the sum over satellites worked out directly."""
     plan = small_plan(span_s=64, onset_s=32)
-    paths = NoisePaths(plan, 40_000, random_generator(7))
+    paths = NoisePaths(plan, 20_000, random_generator(7))
     basis = paths.advance(31)
     gain, variances = plan.geometry.gain, plan.geometry.range_variance_m2
     for lag in (0, 30):
         phi = np.exp(-lag / TAUS_S)
         wanted = np.einsum("ai,ij,j,bi->ab", gain[:2], variances, phi, gain[:2])
         first, last = basis[30 - lag, -2:], basis[30, -2:]
-        assert first @ last.T / 40_000 == pytest.approx(wanted, abs=0.03)
+        assert first @ last.T / 20_000 == pytest.approx(wanted, abs=0.03)
 
 
 def test_exact_sigmas_are_those_of_the_simulated_monitors() -> None:

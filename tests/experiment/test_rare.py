@@ -149,8 +149,8 @@ def test_many_near_thresholds_leave_runs_alive(
 def test_a_miss_that_counting_sees_once_in_a_thousand_over_a_long_time() -> None:
     """Dual constellation, 0.03 m/s, twelve monitors: some 1400 epochs near thresholds, where a shift alone fails."""
     system = linear_bank(default_geometry("gps_galileo"), 0.0, BankSpec(sensors="odometer_and_track"))
-    clever = missed_detection_probability(system, 1_700, 0.03, runs=2_000, seed=3)
-    plain = counted_misses(system, 1_700, 0.03, runs=2_000, seed=4)
+    clever = missed_detection_probability(system, 1_700, 0.03, runs=1_500, seed=3)
+    plain = counted_misses(system, 1_700, 0.03, runs=1_000, seed=4)
     assert 0.002 < plain.value < 0.3
     spread = np.hypot(clever.relative_error * clever.value, plain.relative_error * plain.value)
     assert clever.value == pytest.approx(plain.value, abs=4 * spread)

@@ -48,8 +48,9 @@ def test_by_the_reference_a_frozen_odometer_is_no_standing_train(form):
     assert row(tables)["availability"] < 0.6
 
 
-@pytest.mark.parametrize("form", ["distance", "speed"])
-@pytest.mark.parametrize("lost", [["reference"], ["reference", "balise_reads"]])
+@pytest.mark.parametrize(
+    ("form", "lost"), [("distance", ["reference"]), ("speed", ["reference", "balise_reads"])], ids=["reads", "alone"]
+)
 def test_without_a_reference_nobody_knows_whether_the_train_moved(form, lost):
     """Unknown counts as moving without a TVB: availability may be too low by that, never too high."""
     run, site = journey()

@@ -14,7 +14,7 @@ from tests.replay.random_trials import deviations
 
 # Seeds that failed once stay. 620, 771: faults of the odometer while the position wanders by 3.2 and 3.4 sigma;
 # 1192: a monitor of height fails by chance before a slow ramp.
-SEEDS = (*range(2, 12), 19, 620, 771, 1192)
+SEEDS = (0, *range(2, 12), 19, 620, 771, 1192)
 random_trial = lru_cache(maxsize=len(SEEDS))(draw_trial)
 
 

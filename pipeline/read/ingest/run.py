@@ -54,9 +54,7 @@ def _require_limits(run: RunLog, path: Address, config: IngestConfig) -> RunLog:
     for stream in STREAMS:
         if (frame := run.stream(stream)) is not None:
             refuse_too_many(frame.height, f"{shown(path)}: {stream}", config)
-    solutions = run.gnss["solution"]
-    others = solutions.filter(solutions != solutions.first())  # mostly none
-    if (count := 1 + others.n_unique()) > MOST_TOPICS:
+    if (count := run.gnss["solution"].n_unique()) > MOST_TOPICS:
         raise InputError(
             "holds more solutions of the position than any train has receivers",
             place=f"{shown(path)}: gnss, column solution",

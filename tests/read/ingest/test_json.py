@@ -71,7 +71,7 @@ def at_once(contents: list[bytes], decoder: JsonDecoder | None = None) -> tuple[
     return columns, decoder.slow_messages
 
 
-@settings(max_examples=100, deadline=None, derandomize=True)
+@settings(max_examples=70, deadline=None, derandomize=True)
 @given(payloads)
 def test_what_is_taken_at_once_is_what_the_parser_says(drawn):
     for content in (written(*one) for one in drawn):

@@ -13,15 +13,15 @@ from tests.stages.judge.ride import Leg
 from tests.stages.judge.sensors import Better, Counter, Receiver, seconds
 from tests.stages.judge.world import World, make_journey
 
-SEEDS_EACH = 5
-FIRST_SEEDS = (0, 400)
+# Each of these worlds meets what none of the others does: another branch of the judge, the odometer or the path.
+SEEDS = ((0, 2, 4, 7, 400), (402, 404, 405, 406, 407))
 
 
-@pytest.mark.parametrize("first", FIRST_SEEDS)
-def test_random_runs(first: int) -> None:
+@pytest.mark.parametrize("seeds", SEEDS, ids=["first", "second"])
+def test_random_runs(seeds: tuple[int, ...]) -> None:
     """One random run judged with its reference, with its reads alone, with its odometer alone."""
     found: list[str] = []
-    for seed in range(first, first + SEEDS_EACH):
+    for seed in seeds:
         journey = random_journey(seed)
         rungs = rungs_of(journey)
         # A slip that contradicts the reference leaves open which of the two failed: then neither need decide.

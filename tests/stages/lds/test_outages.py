@@ -64,7 +64,7 @@ def test_slow_drifts_after_a_return() -> None:
     assert max(one.beyond_s for one in by_rule) == 0.0
 
 
-@pytest.mark.parametrize("seed", [32, 1036, 1052, 2009, 2012])
+@pytest.mark.parametrize("seed", [32, 1052, 2012])
 def test_a_drift_found_late_does_not_come_back(seed: int) -> None:
     """0.029 to 0.037 m/s: by an anchor 300 s before the alarm all are in use again beyond 20 m, for 335 s or more."""
     found = outcome(ramp(seed, 1.0 + seed % 2), CONFIG)

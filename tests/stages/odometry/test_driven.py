@@ -117,11 +117,13 @@ def scattered(odometer, kind, size_m):
     return odometer.with_columns(distance_m=pl.Series(distance + noise))
 
 
-CASES = [("noise", 0.1), ("noise", 0.5), ("counts", 0.5), ("counts", 2.0)]
+CASES = [
+    *((STOPS, kind, size_m) for kind, size_m in (("noise", 0.1), ("counts", 2.0))),
+    *((SHUNTING, kind, size_m) for kind, size_m in (("noise", 0.5), ("counts", 0.5), ("counts", 2.0))),
+]
 
 
-@pytest.mark.parametrize(("kind", "size_m"), CASES)
-@pytest.mark.parametrize("motion", [STOPS, SHUNTING])
+@pytest.mark.parametrize(("motion", "kind", "size_m"), CASES)
 def test_way_turns_and_movement_are_those_of_the_train(motion, kind, size_m):
     run, site = journey(motion=motion)
     given = Configuration.model_validate({"monitors": NO_NOISE})
