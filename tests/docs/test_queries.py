@@ -58,19 +58,9 @@ def test_sql_and_polars_agree(
     monkeypatch.chdir(asked)
     names: dict[str, Any] = {}
     exec(PREAMBLE + python.text, names)
-<<<<<<< ours
-    answer, by_sql = names["answer"].collect(), run_sql("OUT", sql.text)
-    assert answer.columns == by_sql.columns
-    assert_same_rows(answer, by_sql)
-||||||| base
-    answer, told = names["answer"].collect(), run_sql("OUT", sql.text)
-    assert answer.columns == told.columns
-    assert_same_rows(answer, told)
-=======
     answer = names["answer"].collect()
     assert answer.columns == told(sql.text).columns
     assert_same_rows(answer, told(sql.text))
->>>>>>> theirs
 
 
 @pytest.mark.parametrize("sql", [sql for sql, _ in PAIRS], ids=lambda block: block.heading[:40])
@@ -78,29 +68,9 @@ def test_duckdb_gives_the_same(
     sql: Block, asked: Path, told: Answers, duck: Any, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(asked)
-<<<<<<< ours
-    with duckdb.connect() as connection:
-        for name in ("hazards", "passages", "alarms", "epochs", "runs"):
-            connection.execute(VIEW_OF_FILES.replace("hazards", name))
-        connection.execute("CREATE VIEW campaign_runs AS SELECT * FROM 'OUT/campaign/runs.parquet'")
-        found = pl.from_arrow(connection.sql(sql.text).to_arrow_table())
-    ours = run_sql("OUT", sql.text)
-    assert ours.columns == found.columns
-    assert_same_rows(found, ours)
-||||||| base
-    with duckdb.connect() as connection:
-        for name in ("hazards", "passages", "alarms", "epochs", "runs"):
-            connection.execute(VIEW_OF_FILES.replace("hazards", name))
-        connection.execute("CREATE VIEW campaign_runs AS SELECT * FROM 'OUT/campaign/runs.parquet'")
-        found = pl.from_arrow(connection.sql(sql.text).to_arrow_table())
-    told = run_sql("OUT", sql.text)
-    assert told.columns == found.columns
-    assert_same_rows(found, told)
-=======
     found = pl.DataFrame(duck.sql(sql.text).to_arrow_table())
     assert told(sql.text).columns == found.columns
     assert_same_rows(found, told(sql.text))
->>>>>>> theirs
 
 
 VIEWS = [view for view in views.views().values() if not view.needs]
@@ -108,31 +78,6 @@ VIEWS = [view for view in views.views().values() if not view.needs]
 
 def test_duckdb_answers_the_views_alike(asked: Path, told: Answers, duck: Any, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(asked)
-<<<<<<< ours
-    with duckdb.connect() as connection:
-        for name in ("hazards", "passages", "alarms", "epochs", "runs"):
-            connection.execute(VIEW_OF_FILES.replace("hazards", name))
-        for view in VIEWS:
-            connection.execute(f"CREATE VIEW {view.name} AS {view.sql}")
-            found = pl.from_arrow(connection.sql(f"SELECT * FROM {view.name}").to_arrow_table())
-            ours = run_sql("OUT", f"SELECT * FROM {view.name}")
-            assert ours.height > 0, view.name
-            assert ours.columns == found.columns
-            of_runs = [name for name in ours.columns if name == "run_ids"]
-            assert_same_rows(*(frame.with_columns(pl.col(of_runs).list.sort()) for frame in (found, ours)))
-||||||| base
-    with duckdb.connect() as connection:
-        for name in ("hazards", "passages", "alarms", "epochs", "runs"):
-            connection.execute(VIEW_OF_FILES.replace("hazards", name))
-        for view in VIEWS:
-            connection.execute(f"CREATE VIEW {view.name} AS {view.sql}")
-            found = pl.from_arrow(connection.sql(f"SELECT * FROM {view.name}").to_arrow_table())
-            told = run_sql("OUT", f"SELECT * FROM {view.name}")
-            assert told.height > 0, view.name
-            assert told.columns == found.columns
-            of_runs = [name for name in told.columns if name == "run_ids"]
-            assert_same_rows(*(frame.with_columns(pl.col(of_runs).list.sort()) for frame in (found, told)))
-=======
     for view in VIEWS:
         duck.execute(f"CREATE VIEW {view.name} AS {view.sql}")
         found = pl.DataFrame(duck.sql(f"SELECT * FROM {view.name}").to_arrow_table())
@@ -141,7 +86,6 @@ def test_duckdb_answers_the_views_alike(asked: Path, told: Answers, duck: Any, m
         assert answer.columns == found.columns
         of_runs = [name for name in answer.columns if name == "run_ids"]
         assert_same_rows(*(frame.with_columns(pl.col(of_runs).list.sort()) for frame in (found, answer)))
->>>>>>> theirs
 
 
 def test_by_epochs_and_by_runs_availability_is_the_same(asked: Path) -> None:
@@ -149,12 +93,12 @@ def test_by_epochs_and_by_runs_availability_is_the_same(asked: Path) -> None:
         "SELECT run_id, solution, 1 - SUM(lost_s) / SUM(moving_s) AS share FROM stretches GROUP BY run_id, solution"
     )
     of_runs = "SELECT run_id, solution, availability FROM runs WHERE availability IS NOT NULL"
-    shares, by_run = (
+    shares, told = (
         {(run, solution): share for run, solution, share in run_sql(asked / "OUT", sql).rows()}
         for sql in (by_epochs, of_runs)
     )
-    assert len(by_run) > 5
-    assert {run: shares[run] for run in by_run} == pytest.approx(by_run)
+    assert len(told) > 5
+    assert {run: shares[run] for run in told} == pytest.approx(told)
 
 
 def test_there_are_ten_questions_on_views() -> None:
