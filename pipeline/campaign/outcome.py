@@ -12,7 +12,7 @@ import polars as pl
 
 from pipeline.campaign.plan import RunJob
 from pipeline.results.figures.hazard_words import hazard_words
-from pipeline.results.figures.head import HAZARD_COUNTS, known_counts, worst_verdict
+from pipeline.results.figures.head import HAZARD_COUNTS, is_judged, worst_verdict
 from pipeline.results.outcome import VERDICT_FIGURES, RunOutcome
 from pipeline.stages.prepare import Provenance
 from pipeline.storage.address import Address, redacted
@@ -107,13 +107,13 @@ def outcome_of(
     run_id: str, log: str, low: float, runs: pl.DataFrame, hazards: pl.DataFrame, passages: pl.DataFrame
 ) -> RunOutcome:
     """The outcome that a run's own tables show; below `low` availability it says what the moving time was lost to."""
-    errors = [error for error in runs["error"] if error is not None]
-    counted = runs.select("status", "evidence", *HAZARD_COUNTS, "missed_detections")
-    judged = [row for row in known_counts(counted).iter_rows(named=True) if row["missed_detections"] is not None]
+    rows = runs.rows(named=True)
+    errors = [row["error"] for row in rows if row["error"] is not None]
+    judged = [row for row in rows if is_judged(row) and row["missed_detections"] is not None]
     hazard_rows = sum(row[name] for row in judged for name in HAZARD_COUNTS)
-    verdict = worst_verdict(runs["verdict"].to_list())
+    verdict = worst_verdict([row["verdict"] for row in rows])
     # The solutions that have the verdict of the run.
-    rows = [row for row in runs.iter_rows(named=True) if verdict is not None and row["verdict"] == verdict.value]
+    heads = [row for row in rows if verdict is not None and row["verdict"] == verdict.value]
     return RunOutcome(
         run_id=run_id,
         status=worst_status(runs),
@@ -121,10 +121,10 @@ def outcome_of(
         verdict=verdict,
         hazards=hazard_rows if judged else None,
         missed_detections=sum(row["missed_detections"] for row in judged) if judged else None,
-        why=_verdict_reasons(rows, several=runs.height > 1),
+        why=_verdict_reasons(heads, several=len(rows) > 1),
         faults=tuple(hazard_words(hazards, passages)),
         log=redacted(log),
-        **(_verdict_figures(rows[0], low) if rows else {}),
+        **(_verdict_figures(heads[0], low) if heads else {}),
     )
 
 

@@ -89,6 +89,11 @@ JUDGED_COUNTS = (
 """Counts that need evidence: a run without any has none, which is not the same as having found nothing."""
 
 
+def is_judged(row: Mapping[str, Any]) -> bool:
+    """Whether the judged counts of a row of `runs` mean something, as in `known_counts`."""
+    return row["status"] != RunStatus.FAILED and row["evidence"] is not None
+
+
 def known_counts(runs: pl.DataFrame) -> pl.DataFrame:
     """Rows of `runs` with null for counts that mean nothing: all of a failed run, the judged ones without evidence.
 

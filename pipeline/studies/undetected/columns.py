@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from functools import lru_cache
+
 import dataframely as dy
 import numpy as np
 import polars as pl
@@ -94,8 +96,14 @@ def largest_unnoticed(monitored: MonitoredSolution) -> Undetected:
 
 def _null_columns(table: type[dy.Schema], rows: int) -> pl.DataFrame:
     """The columns of a table that are computed here, null in every row."""
+    return pl.DataFrame([null.new_from_index(0, rows) for null in _nulls(table)])
+
+
+@lru_cache(maxsize=8)
+def _nulls(table: type[dy.Schema]) -> list[pl.Series]:
+    """One null of each column that is computed here."""
     kinds = {name: kind for name, kind in dtypes(table).items() if name.startswith(("undetected_", "physical_"))}
-    return pl.DataFrame(schema=kinds).clear(rows)
+    return [pl.Series(name, [None], dtype=kind) for name, kind in kinds.items()]
 
 
 def _gather_columns(at_rows: pl.DataFrame, at: Ints) -> pl.DataFrame:

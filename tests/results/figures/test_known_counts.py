@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from pipeline.campaign.outcome import outcome_of
-from pipeline.results.figures.head import known_counts
+from pipeline.results.figures.head import is_judged, known_counts
 from pipeline.results.store import write_run
 from pipeline.show.inspection import inspect_result
 from schemas.run import RunTables
@@ -33,6 +33,7 @@ def test_without_evidence_the_judged_counts_are_not_known_and_of_a_failed_run_no
     assert found["balises_accepted"].to_list() == [8, 7, None]
     assert found["alarms"].to_list() == [0, 0, None]
     assert found.columns == ROWS.columns
+    assert [is_judged(row) for row in ROWS.iter_rows(named=True)] == [True, False, False]
 
 
 def test_outcome_of_a_run() -> None:
