@@ -68,13 +68,14 @@ def passages_table(
     t_true = passages["t_true"]
     virtual = _equal_to(passages["kind"], BaliseKind.VIRTUAL)
     accepted = virtual & _equal_to(passages["status"], PassageStatus.ACCEPTED)
-    offered_ns = ints(passages["t_offered"].cast(pl.Int64))
-    positioned = _is_interpolated(stamps, ints(t_true), given.config.lds) & t_true.is_not_null().to_numpy()
+    # Instants are after 1970, so that -1 is none.
+    offered_ns, true_ns = ints(passages["t_offered"].cast(pl.Int64)), ints(t_true)
+    positioned = _is_interpolated(stamps, true_ns, given.config.lds) & (true_ns >= 0)
     of_offers, inserted = _offer_columns(passages, offers, rows)
     frame = passages.with_columns(
         t_true.cast(pl.Datetime("ns", "UTC")),
         *of_offers,
-        _passage_speeds_mps(passages, t_true, epochs, given.config.lds),
+        _passage_speeds_mps(np.where(offered_ns >= 0, offered_ns, true_ns), epochs, given.config.lds),
         pl.Series("suspect_after_the_fact", accepted & inside_spans(offered_ns, undetected)),
     )
     return frame.with_columns(failure_columns(frame, inserted, positioned)).select(Passages.column_names())
@@ -148,12 +149,11 @@ def _is_interpolated(stamps: Ints, t_ns: Ints, lds: LdsConfig) -> Bools:
     return np.asarray(inside & (stamps[after] - stamps[after - 1] <= crossing_gaps_ns(stamps, lds)[after]))
 
 
-def _passage_speeds_mps(passages: pl.DataFrame, t_true: pl.Series, epochs: AlignedEpochs, lds: LdsConfig) -> pl.Series:
-    """Speed of the train at the offer, else where it passed [m/s]; null in a gap of the epochs."""
-    at = passages["t_offered"].cast(pl.Int64).fill_null(t_true)
+def _passage_speeds_mps(at_ns: Ints, epochs: AlignedEpochs, lds: LdsConfig) -> pl.Series:
+    """Speed of the train at the offer, else where it passed [m/s]; null in a gap of the epochs, or where -1."""
     stamps = epochs.t_ns[np.isfinite(epochs.speed_mps)]
-    known = at.is_not_null().to_numpy() & _is_interpolated(stamps, ints(at), lds)
-    return pl.Series("speed_mps", np.where(known, speed_at_mps(epochs, ints(at)), np.nan), nan_to_null=True)
+    known = (at_ns >= 0) & _is_interpolated(stamps, at_ns, lds)
+    return pl.Series("speed_mps", np.where(known, speed_at_mps(epochs, at_ns), np.nan), nan_to_null=True)
 
 
 def failure_columns(passages: pl.DataFrame, inserted: Bools, positioned: Bools) -> list[pl.Series]:

@@ -171,7 +171,10 @@ def unbounded_notes(epochs: JudgedEpochs, undetected: pl.DataFrame) -> list[Rema
 
     `undetected`: columns of `epochs`, null where nothing was computed.
     """
-    used = epochs.in_use & undetected["undetected_ahead_m"].is_not_null().to_numpy()
+    ahead_m = undetected["undetected_ahead_m"]
+    if ahead_m.null_count() == len(ahead_m):
+        return []
+    used = epochs.in_use & ahead_m.is_not_null().to_numpy()
     unbounded = int((used & undetected["undetected_ahead_in_use_m"].is_null().to_numpy()).sum())
     return remarks({Note.IN_USE_UNBOUNDED: (unbounded, int(used.sum())) if unbounded else None})
 
