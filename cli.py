@@ -641,8 +641,8 @@ def make_a_site(
     from pipeline.show.report.site_page import site_page
     from schemas.enums import TravelAlong
 
-    wish = site_request(surveys, balises, epsg, join, flat, TravelAlong(direction), id_field, sigma)
-    site = make_site(wish, _load_vehicle(vehicle), _load_configuration(config))
+    request = site_request(surveys, balises, epsg, join, flat, TravelAlong(direction), id_field, sigma)
+    site = make_site(request, _load_vehicle(vehicle), _load_configuration(config))
     write_site(site, site_page(out.resolve().name, site), out, force)
     elements, findings = elements_table(site), findings_table(site.findings)
     made = {"out": out, "page": out / "site.html", "elements": elements, "findings": findings, "balises": site.balises}

@@ -185,8 +185,8 @@ def _collect_results(
     against = {
         Reason.ODOMETER_ORIGIN_UNKNOWN: odometry is not None and not odometry.origin.independent,
         Reason.ODOMETER_FOLLOWS_GNSS: odometry is not None and odometry.follows_gnss,
-        Reason.EVIDENCE_DISPUTED: evidence.count_disputed_reads > 0 or evidence.parted,
-        Reason.EVIDENCE_CONTRADICTED: evidence.doubted > 0,
+        Reason.EVIDENCE_DISPUTED: evidence.count_disputed_reads > 0 or evidence.odometers_disagree,
+        Reason.EVIDENCE_CONTRADICTED: evidence.contradiction_count > 0,
         Reason.TRACK_ASSUMED: _rests_on_assumed_track(judged),
         Reason.SIGMA_DOUBTFUL: refuted(accuracy),
         Reason.INPUT_DOUBTFUL: bool(

@@ -78,7 +78,7 @@ def _aligned(config: Configuration) -> tuple[AlignedEpochs, Odometry]:
     odometry = odometry_of(made.run.odometer, made.vehicle, config)
     assert odometry is not None
     matched = match(made.run.gnss, odometry, made.site, made.vehicle, config.matching, config.fix_sigma, None)
-    odometry = odometry.oriented(matched.odometer_sign)
+    odometry = odometry.growing_along_path(matched.odometer_sign)
     return align(matched.epochs, odometry, made.vehicle, config), odometry
 
 

@@ -64,7 +64,7 @@ def _ways(rng: np.random.Generator, rate_hz: int, least_m: float, most_m: float)
     at = np.sort(rng.choice(t_s.size, 60, replace=False))
     begin, end = (ends.ravel() for ends in np.triu_indices(at.size, 1))
     at_ns = odometry.epoch_ns + np.round(t_s[at] * 1e9).astype(np.int64)
-    way = odometry.between(at_ns[begin], at_ns[end])
+    way = odometry.distance_and_variance(at_ns[begin], at_ns[end])
     error_m = np.abs(way.distance_m - (true_m[at[end]] - true_m[at[begin]]))
     known = np.isfinite(way.distance_m) & (way.bound_m < 5e5)
     return np.maximum(error_m - way.bound_m, 0.0), known

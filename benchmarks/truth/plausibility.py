@@ -58,7 +58,7 @@ def is_reported(wrong: Wrong, drawn: Trip) -> tuple[bool, list[str]]:
     found = fit_of(wrong.change(drawn.run), site, vehicle)
     if isinstance(found, str):
         return all(word in found for word in wrong.reported), [found]
-    checks = found.impossible if wrong.fails else found.misfits
+    checks = found.impossible_checks if wrong.fails else found.misfits
     return any(_says(check, wrong) for check in checks), [check.sentence for check in found.misfits]
 
 
@@ -81,7 +81,7 @@ def measure(_: Path) -> list[Figure]:
     for wrong in WRONGS:
         for drawn in [drawn for seed in range(8) if applies(wrong, drawn := trip(seed, place=wrong.place))][:3]:
             tried, found = tried + 1, found + is_reported(wrong, drawn)[0]
-    refused = sum(isinstance(fit, str) or bool(fit.impossible) for _, _, fit, _ in faulty(100))
+    refused = sum(isinstance(fit, str) or bool(fit.impossible_checks) for _, _, fit, _ in faulty(100))
     return [
         Figure("wrong recordings reported with their cause", found / tried, "1", target=0.97, better="above"),
         Figure("faulty but plausible runs that fail, of 100", float(refused), "1", target=0.0),
@@ -116,9 +116,9 @@ def _plausible(count: int) -> int:
     refused, noted, seconds = 0, Counter[str](), []
     for seed, _, fit, taken in faulty(count):
         seconds.append(taken)
-        if isinstance(fit, str) or fit.impossible:
+        if isinstance(fit, str) or fit.impossible_checks:
             refused += 1
-            said = fit if isinstance(fit, str) else "; ".join(check.sentence for check in fit.impossible)
+            said = fit if isinstance(fit, str) else "; ".join(check.sentence for check in fit.impossible_checks)
             print(f"plausible run {seed} fails: {said}", flush=True)
         else:
             noted.update(check.what for check in fit.checks if check.state is FitState.MISFIT)

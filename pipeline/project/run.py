@@ -201,12 +201,12 @@ def _make_site_if_changed(steps: _Steps) -> None:
         return
     config = steps.opened.given_config()
     vehicle = steps.opened.given_vehicle()
-    wish = requested_site(steps.opened, entry)
-    sources = [*wish.surveys, *([wish.balise_list] if wish.balise_list else [])]
+    request = requested_site(steps.opened, entry)
+    sources = [*request.surveys, *([request.balise_list] if request.balise_list else [])]
     _require_sources(sources, steps.opened)
     site = Path(steps.opened.place(steps.opened.project.site))
     product = Product(f"site {steps.opened.project.site}", site, digest_over(entry, vehicle, config))
-    if not steps.make_if_changed(product, lambda: _make_site(steps, wish, site, vehicle, config)):
+    if not steps.make_if_changed(product, lambda: _make_site(steps, request, site, vehicle, config)):
         steps.call.said("site", "up to date")
 
 
@@ -222,10 +222,10 @@ def _require_sources(sources: Sequence[Path], opened: OpenedProject) -> None:
             )
 
 
-def _make_site(steps: _Steps, wish: SiteRequest, site: Path, vehicle: Vehicle, config: Configuration) -> list[Path]:
+def _make_site(steps: _Steps, request: SiteRequest, site: Path, vehicle: Vehicle, config: Configuration) -> list[Path]:
     """Make the site, write it with its page and findings; returns the files."""
-    steps.call.said("site", f"made of {', '.join(path.name for path in wish.surveys)}")
-    made = make_site(wish, vehicle, config)
+    steps.call.said("site", f"made of {', '.join(path.name for path in request.surveys)}")
+    made = make_site(request, vehicle, config)
     write_site(made, site_page(site.resolve().name, made), site, True)
     for line in summarise_findings(made.findings, f"{site / 'findings.csv'}"):
         steps.call.said("site", line)

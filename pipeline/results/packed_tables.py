@@ -95,10 +95,10 @@ def _open_by_footer(file: _File, footer: pq.FileMetaData) -> GroupedFile:
 def _read_footer(file: _File) -> pq.FileMetaData:
     """What the end of the file says. Refuses the file of another result under the name of this one."""
     try:
-        end = parquet.end_of(files.in_parts(join(file.out, packs.file_name(file.table, file.name))))
+        end = parquet.read_footer(files.in_parts(join(file.out, packs.file_name(file.table, file.name))))
         if sha256(end) != file.end:
             raise ParquetError("it is not the one that was packed")
-        return parquet.metadata_in(end)
+        return parquet.parse_footer(end)
     except (ParquetError, InputError) as error:
         raise packs.unusable_error(file.out, packs.file_name(file.table, file.name), str(error)) from None
 

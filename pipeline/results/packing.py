@@ -178,7 +178,7 @@ class _PackWriter:
             bytes=sum(map(len, contents.values())),
             software_digest=step.software_digest,
             sha256={part: sha256(content) for part, content in contents.items()},
-            ends={table: sha256(parquet.end_of(io.BytesIO(contents[table]))) for table in TABLES},
+            ends={table: sha256(parquet.read_footer(io.BytesIO(contents[table]))) for table in TABLES},
         )
 
 

@@ -78,7 +78,7 @@ def monitor_solution(
     """
     config = prepared.config
     matched = matches[solution]
-    odometry = None if prepared.odometry is None else prepared.odometry.oriented(matched.odometer_sign)
+    odometry = None if prepared.odometry is None else prepared.odometry.growing_along_path(matched.odometer_sign)
     aligned, along = alignment(matched.epochs, odometry, prepared.vehicle, config)
     if odometry is None:
         # A balise valid in one direction means that of the train, not of one step of the positions (DOMAIN section 4).

@@ -70,6 +70,7 @@ class Budget:
             plain.write(piece)
 
     def _spent(self, message: str, key: str, unit: str) -> InputError:
+        """The error for a limit that is exceeded; `key`: its name in the configuration, `unit` of its value."""
         limit = getattr(self._config, key)
         return InputError(
             message,

@@ -90,5 +90,6 @@ def _kind_text(kind: pl.DataType) -> str:
 
 
 def _unit_and_meaning(field: pa.Field) -> tuple[str, str]:
+    """Unit and meaning that a file notes in a field; empty where it notes none."""
     notes = field.metadata or {}
     return notes.get(b"unit", b"").decode(errors="replace"), notes.get(b"meaning", b"").decode(errors="replace")

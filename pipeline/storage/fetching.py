@@ -14,7 +14,7 @@ from typing import Any
 
 from pipeline.storage.address import Address, check_public, is_url, name_of, redacted
 from pipeline.storage.noted import note, scratch_folder
-from pipeline.storage.object_store import arrivals, on_store, opened
+from pipeline.storage.object_store import arrivals, on_store, open_store
 from pipeline.storage.objects import AlteredError, Listing, check_copy, entries_of, kind_of, objects_at, version_in
 from schemas.errors import InputError, OutputError, UsageError
 
@@ -86,11 +86,13 @@ def files_below(address: Address) -> list[str]:
 
 
 def _raise_listing(error: OSError) -> None:
+    """Raise `OutputError` for a folder that cannot be listed, unless it does not exist."""
     if not isinstance(error, FileNotFoundError):
         raise OutputError(f"cannot be listed: {error.strerror}", place=str(error.filename)) from None
 
 
 def _names_below(store: Any, place: str, before: str) -> Iterator[str]:
+    """Paths of all files below a place in a store, folders within it included, each behind `before`."""
     for entry in entries_of(store, place):
         name = f"{before}{name_of(entry['name'])}"
         if entry["type"] == "directory":
@@ -118,6 +120,7 @@ def require_match(name: str) -> list[Address]:
 
 
 def _matches(name: str) -> list[Address]:
+    """The runs, folders or addresses that a name or pattern matches; none where nothing does."""
     if is_url(name):
         check_public(name)
         # A question mark in a web address begins its query.
@@ -159,6 +162,7 @@ def _globbed(store: Any, pattern: str) -> list[str]:
 
 
 def _folders_below(store: Any, place: str) -> Iterator[str]:
+    """A folder in a store, and all folders below it."""
     yield place
     for entry in entries_of(store, place):
         if entry["type"] == "directory":
@@ -177,9 +181,10 @@ def read_many(addresses: list[str]) -> dict[str, bytes]:
     if not addresses or not is_url(addresses[0]):
         contents = {address: content_of(address) for address in addresses}
         return {address: content for address, content in contents.items() if content is not None}
-    by_path = {opened(address)[1]: address for address in addresses}
+    by_path = {open_store(address)[1]: address for address in addresses}
 
     def fetch(store: Any, _: str) -> dict[str, bytes]:
+        """Contents of those files that exist, asked for together; any other error is raised."""
         answers: dict[str, bytes | Exception] = store.cat(list(by_path), on_error="return")
         for content in answers.values():
             if isinstance(content, Exception) and not isinstance(content, FileNotFoundError):

@@ -25,17 +25,17 @@ _LEAST_PART = 262_144
 
 def exists(path: Address) -> bool:
     """Whether something lies at an address."""
-    return _either(path, Path.exists, lambda store, inner: bool(kind_of(store, inner)))
+    return _run_local_or_remote(path, Path.exists, lambda store, inner: bool(kind_of(store, inner)))
 
 
 def is_dir(path: Address) -> bool:
     """Whether a folder lies at an address."""
-    return _either(path, Path.is_dir, lambda store, inner: kind_of(store, inner) == "directory")
+    return _run_local_or_remote(path, Path.is_dir, lambda store, inner: kind_of(store, inner) == "directory")
 
 
 def list_dir(path: Address) -> list[str]:
     """Names in a folder, sorted."""
-    return _either(
+    return _run_local_or_remote(
         path,
         lambda folder: sorted(entry.name for entry in folder.iterdir()),
         lambda store, inner: sorted(name_of(f"x://{entry}") for entry in store.ls(inner, detail=False)),
@@ -112,10 +112,11 @@ def _regular(path: Path) -> Path:
 
 def size_of(path: Address) -> int:
     """Size of a file [bytes]."""
-    return _either(path, lambda file: file.stat().st_size, lambda store, inner: int(store.size(inner)))
+    return _run_local_or_remote(path, lambda file: file.stat().st_size, lambda store, inner: int(store.size(inner)))
 
 
-def _either(path: Address, local: Callable[[Path], T], remote: Callable[[Any, str], T]) -> T:
+def _run_local_or_remote(path: Address, local: Callable[[Path], T], remote: Callable[[Any, str], T]) -> T:
+    """Run one operation on a local path or the other on a store, noting that the place was read."""
     note(path)
     return on_store(path, remote, kind=InputError) if is_url(path) else _local(path, local)
 

@@ -29,6 +29,8 @@ def version(address: Address) -> str | None:
 
 
 class FileDigest(NamedTuple):
+    """Name, size and SHA-256 of a file."""
+
     name: str
     size_bytes: int
     sha256: str

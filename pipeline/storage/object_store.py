@@ -41,7 +41,7 @@ def on_store(address: Address, operation: Callable[[Any, str], T], kind: type[Ba
     An answer that may be another one later (busy, broken connection, none at all) is asked for again as long as
     there is patience: `BALISE_STORE_PATIENCE_S` seconds without anything having come, 45 unless set.
     """
-    store, path = opened(address, kind)
+    store, path = open_store(address, kind)
     limit_s = patience_s()
     watched = _PatientStore(store, limit_s)
     reason = "no answer"
@@ -76,8 +76,16 @@ def patience_s() -> float:
     return limit_s
 
 
-def opened(address: Address, kind: type[BaliseError] = OutputError) -> tuple[Any, str]:
-    """The file system of an address and its path there: every access to a store goes through this one."""
+def open_store(address: Address, kind: type[BaliseError] = OutputError) -> tuple[Any, str]:
+    """The file system of an address and its path there, through which every access to a store goes.
+
+    Args:
+        address: address in an object store.
+        kind: kind of the error that is raised.
+
+    Raises:
+        BaliseError: of this kind; nothing is installed for such addresses, or the address is none.
+    """
     check_public(address)
     protocol, _, rest = str(address).partition("://")
     try:
@@ -93,6 +101,7 @@ def opened(address: Address, kind: type[BaliseError] = OutputError) -> tuple[Any
 
 @lru_cache(maxsize=64)
 def _filesystem(protocol: str, root: str) -> Any:
+    """The file system of a bucket or server, made once per process."""
     import fsspec
 
     settings = {**_SETTINGS.get(protocol, {}), **fsspec.config.conf.get(protocol, {})}
@@ -118,6 +127,7 @@ class _PatientStore:
         self._since_s = time.monotonic()
 
     def __getattr__(self, name: str) -> Any:
+        """An operation of the store; where it is asynchronous, one that ends after too long a silence."""
         ours = getattr(self._store, f"_{name}", None)
         if name == "cat" and inspect.iscoroutinefunction(ours):
             ours = partial(type(self._store)._cat, self)  # which asks for each file through `_cat_file` below
@@ -134,6 +144,7 @@ class _PatientStore:
         return content
 
     async def _within(self, operation: Callable[..., Awaitable[T]], *args: object, **kwargs: object) -> T:
+        """Await an operation. Raises `TimeoutError` once nothing has come for longer than the limit."""
         import asyncio  # whoever asks a store has loaded it already
 
         task = asyncio.ensure_future(operation(*args, **kwargs))
@@ -152,11 +163,15 @@ def arrivals(store: _PatientStore) -> Any:
     from fsspec.callbacks import Callback
 
     class Arrivals(Callback):  # type: ignore[misc]
+        """Counts every byte that arrives as a sign of life."""
+
         # fsspec asks for it before each file (`Callback.branch_coro`).
         def branched(self, *_: object, **__: object) -> Callback:
+            """Itself, for each single file."""
             return self
 
         def call(self, *_: object, **__: object) -> None:
+            """Bytes have arrived."""
             store.arrived()
 
     return Arrivals()
@@ -170,6 +185,7 @@ def _words_of(error: Exception, before: str) -> str:
 
 
 def _tries(error: Exception) -> int:
+    """How often an operation is tried that ends in this error."""
     if isinstance(error, FileNotFoundError | PermissionError):
         return 1
     if isinstance(error, AlteredError):
@@ -185,18 +201,21 @@ def _may_pass(error: Exception) -> bool:
 
 
 def _absent(address: Address) -> InputError:
+    """The error for an address at which there is nothing."""
     return InputError(
         "does not exist", place=redacted(str(address)), expected="a file or folder", remedy="Check the address."
     )
 
 
 def _failure(unanswered_s: float | None) -> str:
+    """How the message about a failure begins: refused, or without an answer for so long [s]."""
     return (
         "the store refused: " if unanswered_s is None else f"the store gave no usable answer for {unanswered_s:g} s: "
     )
 
 
 def _refused(address: Address, reason: str, kind: type[BaliseError]) -> BaliseError:
+    """The error, of this kind, for an operation that failed for good; without secrets of the address."""
     return kind(
         redacted(reason),
         place=redacted(str(address)),

@@ -51,12 +51,13 @@ def parquet_bytes(
 
 
 def _noted(field: pa.Field, notes: pa.KeyValueMetadata | None) -> pa.Field:
-    """The field with notes behind what it holds."""
+    """The field with notes added to its metadata."""
     held = field.metadata
     return field if notes is None else field.with_metadata({**held, **notes} if held else notes)
 
 
 def _row_group(frame: pl.DataFrame, first: int) -> pa.Table:
+    """The rows of one row group, from `first` on, as Arrow."""
     return frame.slice(first, _ROWS_PER_GROUP).rechunk().to_arrow()
 
 
@@ -102,6 +103,7 @@ class GroupedWriter:
         return self._buffer.getvalue()
 
     def _flush(self) -> None:
+        """Write the tables that wait as row groups."""
         if self._waiting:
             self._writer.write_table(pa.concat_tables(self._waiting), self._rows_per_group)
         self._waiting = []
@@ -109,6 +111,7 @@ class GroupedWriter:
 
 
 def _has_dictionary(kind: pa.DataType) -> bool:
+    """Whether columns of this type are written by dictionary: enums and texts."""
     return bool(pa.types.is_dictionary(kind) or pa.types.is_large_string(kind))
 
 
@@ -195,6 +198,7 @@ class TableReader:
             return frame if frame.columns == self._wanted else frame.select(self._wanted)
 
     def _names(self, kind: pa.Schema) -> list[str]:
+        """Names of the columns to read. Raises `ValueError` where two columns have one name."""
         names = list(kind.names)
         if len(set(names)) < len(names):
             raise ValueError("two columns have the same name")
@@ -216,8 +220,18 @@ def unpacked_size(content: bytes) -> int:
         return max(file.values, file.rows) * _BYTES_OF_A_VALUE
 
 
-def end_of(source: Path | IO[bytes]) -> bytes:
-    """The end of a file, which says where all else is and between which values it lies. Raises `ParquetError`."""
+def read_footer(source: Path | IO[bytes]) -> bytes:
+    """The bytes of the footer, which says where all else is and between which values it lies.
+
+    Args:
+        source: a Parquet file.
+
+    Returns:
+        The end of the file: metadata, their length, and the four letters.
+
+    Raises:
+        ParquetError: the file is cut short, or is none.
+    """
     with _reading(), source.open("rb") if isinstance(source, Path) else nullcontext(source) as file:
         size = file.seek(0, os.SEEK_END)
         file.seek(max(size - _TAIL, 0))
@@ -229,10 +243,10 @@ def end_of(source: Path | IO[bytes]) -> bytes:
         return file.read()
 
 
-def metadata_in(end: bytes) -> pq.FileMetaData:
-    """What the end of a file says. Raises `ParquetError`."""
+def parse_footer(footer: bytes) -> pq.FileMetaData:
+    """The metadata of a file by the bytes of its footer, as of `read_footer`. Raises `ParquetError`."""
     with _reading():
-        return pq.read_metadata(pa.BufferReader(end))
+        return pq.read_metadata(pa.BufferReader(footer))
 
 
 def without_checksums(content: bytes) -> bool:
@@ -282,9 +296,11 @@ class TableFile:
         return reader.frame()
 
     def _groups(self) -> Iterator[pq.RowGroupMetaData]:
+        """Metadata of each row group."""
         return (self._metadata.row_group(number) for number in range(self._metadata.num_row_groups))
 
     def _parts(self, group: pq.RowGroupMetaData) -> Iterator[pq.ColumnChunkMetaData]:
+        """Metadata of each column in a row group."""
         return (group.column(number) for number in range(self._metadata.num_columns))
 
 
@@ -327,6 +343,7 @@ class GroupedFile:
         return sorted({number for span in spans for number in self._groups(span)})
 
     def _groups(self, span: Span) -> range:
+        """Numbers of the row groups that hold the rows of a span."""
         if span[0] >= span[1]:
             return range(0)
         first, last = np.searchsorted(self._starts, [span[0], span[1] - 1], side="right") - 1
@@ -359,5 +376,6 @@ def _merge_spans(spans: Sequence[Span]) -> list[Span]:
 
 
 def _empty(kind: pa.Schema) -> pl.DataFrame:
+    """A frame without rows, of the columns and types that polars makes of a schema."""
     # Not `empty_table()`: through it pyarrow imports pandas, where that is installed, in every process.
     return pl.DataFrame(pl.from_arrow(pa.Table.from_batches([], kind)))

@@ -114,6 +114,7 @@ def replace_files(folder: Path, contents: Mapping[str, bytes | None], marker: st
 
 
 def _temporary(final: Path) -> Path:
+    """A hidden name, not yet taken, beside the final one."""
     return final.with_name(f".{final.name[:_OF_THE_NAME]}.{secrets.token_hex(_RANDOM_BYTES)}.tmp")
 
 
@@ -154,6 +155,7 @@ def commit(staged: list[tuple[Address, Address]]) -> None:
 
 
 def _commit(staged: list[tuple[Address, Address]]) -> None:
+    """Rename the staged files on this machine, the last one once the others are on the disk."""
     local = [(Path(temporary), Path(final)) for temporary, final in staged if temporary != final]
     for part in (local[:-1], local[-1:]):
         for temporary, final in part:
@@ -252,7 +254,10 @@ def remove_folders(folders: Sequence[Address]) -> None:
 
 
 def _remove_remote(address: Address, operation: Callable[[Any, str], None]) -> None:
+    """Run a removal on the store of an address; that nothing is there is no error."""
+
     def delete(store: Any, path: str) -> None:
+        """The removal, content with nothing to remove."""
         with contextlib.suppress(FileNotFoundError):
             operation(store, path)
 

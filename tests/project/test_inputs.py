@@ -62,8 +62,8 @@ def heard() -> Iterator[list[Path]]:
 
 
 def survey(*paths: Path, balises: Path | None = None) -> Reading:
-    wish = site_request(list(paths), None if balises is None else str(balises), None, None, False)
-    return lambda: make_site(wish, Vehicle(), Configuration())
+    request = site_request(list(paths), None if balises is None else str(balises), None, None, False)
+    return lambda: make_site(request, Vehicle(), Configuration())
 
 
 def logs(folder: Path, *named: str, **mapping: object) -> Reading:

@@ -22,7 +22,7 @@ from pipeline.results import catalogue, packing, packs, store
 from pipeline.results.diff import diff_results
 from pipeline.results.manifest import write_manifest
 from pipeline.results.query import run_sql
-from pipeline.storage.parquet import GroupedFile, end_of
+from pipeline.storage.parquet import GroupedFile, read_footer
 from schemas.errors import UsageError
 from schemas.run import RunTables
 from schemas.tables import TABLES
@@ -273,7 +273,8 @@ def list_anew(out: Path, digests: dict[str, str]) -> None:
     first = listed["packs"][0]
     first["sha256"] = digests
     first["ends"] = {
-        name: hashlib.sha256(end_of(out / name / f"compact/{first['name']}.parquet")).hexdigest() for name in TABLES
+        name: hashlib.sha256(read_footer(out / name / f"compact/{first['name']}.parquet")).hexdigest()
+        for name in TABLES
     }
     (out / packs.LIST).write_text(json.dumps(listed))
 

@@ -36,7 +36,7 @@ def stages(vehicle, with_odometer):
     run = run.with_streams(gnss=run.gnss.with_columns(unknown))
     odometry = odometry_of(run.odometer if with_odometer else None, vehicle, CONFIG)
     found = match(run.gnss, odometry, site, vehicle, CONFIG.matching, CONFIG.fix_sigma)
-    oriented = None if odometry is None else odometry.oriented(found.odometer_sign)
+    oriented = None if odometry is None else odometry.growing_along_path(found.odometer_sign)
     return run, found.epochs, align(found.epochs, oriented, vehicle, CONFIG)
 
 

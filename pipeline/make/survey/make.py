@@ -82,27 +82,27 @@ def site_request(
     return SiteRequest(surveys, spacing, travel, balise_list, epsg, join_m, flat, id_field, sigma_m)
 
 
-def make_site(wish: SiteRequest, vehicle: Vehicle, config: Configuration) -> Site:
+def make_site(request: SiteRequest, vehicle: Vehicle, config: Configuration) -> Site:
     """The site of surveys, with findings of the survey and of the site itself. `track` has `line_km` besides.
 
     Raises `SiteError`, `UsageError`.
     """
-    if wish.join_m is not None and not 0.0 <= wish.join_m <= config.site.joined_m:
+    if request.join_m is not None and not 0.0 <= request.join_m <= config.site.joined_m:
         expected = f"0 to {config.site.joined_m:g} m"
-        raise UsageError("is no reach", place=f"--join {wish.join_m:g}", expected=expected)
-    survey = clean_traces(read_surveys(wish.surveys, wish.epsg, vehicle, config, wish.id_field), config.survey)
-    if wish.flat:
+        raise UsageError("is no reach", place=f"--join {request.join_m:g}", expected=expected)
+    survey = clean_traces(read_surveys(request.surveys, request.epsg, vehicle, config, request.id_field), config.survey)
+    if request.flat:
         survey.pieces = [replace(piece, height_m=np.full(len(piece), np.nan)) for piece in survey.pieces]
-    if wish.sigma_m is not None:
-        survey.pieces = [piece.with_sigma(wish.sigma_m) for piece in survey.pieces]
-    network = make_network(survey, wish.join_m, config.survey)
+    if request.sigma_m is not None:
+        survey.pieces = [piece.with_sigma(request.sigma_m) for piece in survey.pieces]
+    network = make_network(survey, request.join_m, config.survey)
     if not network.elements:
-        raise SiteError("nothing is left of the survey", place=", ".join(map(str, wish.surveys)))
-    balises = _requested_balises(wish, network, survey, config)
+        raise SiteError("nothing is left of the survey", place=", ".join(map(str, request.surveys)))
+    balises = _requested_balises(request, network, survey, config)
     track = network.track
     remarked = check_site(track_of(track), network.links, balises, None, survey.declared_m, config.site)
     if remarked.breaches:
-        raise SiteError(remarked.breaches[0], place=", ".join(map(str, wish.surveys)))
+        raise SiteError(remarked.breaches[0], place=", ".join(map(str, request.surveys)))
     # Relations as given: what no train can run over is said, and left out, each time that the site is read.
     site = Site(track, network.links, balises, None)
     findings = (
@@ -116,13 +116,15 @@ def make_site(wish: SiteRequest, vehicle: Vehicle, config: Configuration) -> Sit
 
 
 def _requested_balises(
-    wish: SiteRequest, network: SurveyNetwork, survey: Survey, config: Configuration
+    request: SiteRequest, network: SurveyNetwork, survey: Survey, config: Configuration
 ) -> pl.DataFrame | None:
-    """Balises at a spacing or from a list, whichever is wished."""
-    if wish.spacing_m is not None:
-        table = balises_every(network, wish.spacing_m, wish.travel)
+    """Balises at a spacing or from a list, whichever is requested; None where neither is."""
+    if request.spacing_m is not None:
+        table = balises_every(network, request.spacing_m, request.travel)
         return table if table.height else None
-    return None if wish.balise_list is None else balises_of_list(wish.balise_list, network, wish.epsg, survey, config)
+    if request.balise_list is None:
+        return None
+    return balises_of_list(request.balise_list, network, request.epsg, survey, config)
 
 
 def write_site(site: Site, page: str, out: Path, force: bool) -> None:

@@ -122,6 +122,7 @@ def _may_be(column: dy.Column, dtype: pl.DataType) -> bool:
 
 
 def _lossless(series: pl.Series, column: dy.Column, target: pl.DataType) -> pl.Series | str:
+    """The series as the type of the contract, or what was found instead where that would lose something."""
     if not _may_be(column, series.dtype):
         return str(series.dtype)
     if isinstance(series.dtype, pl.Datetime):
@@ -185,6 +186,7 @@ def all_finite(series: pl.Series) -> bool:
 
 
 def _out_of_range(where: str, value: object, mask: pl.Series, expected: str) -> InputError:
+    """The breach for the rows (`mask`) of a column that lie outside a limit."""
     found = f"{value} in {rows_text(mask.fill_null(False))}"
     return InputError("is out of range", place=where, found=found, expected=expected, remedy="Correct the recording.")
 

@@ -184,9 +184,11 @@ class _Texts:
         self._bytes[self._ends - lengths - 1] = ord("\n")
 
     def __len__(self) -> int:
+        """Number of texts."""
         return len(self.lengths)
 
     def __iter__(self) -> Iterator[bytes]:
+        """The texts in order."""
         for end, length in zip(self._ends.tolist(), self.lengths.tolist(), strict=True):
             yield bytes(self.content[end - length : end])
 

@@ -105,6 +105,7 @@ def fixed(offset: int, dtype: str) -> Field:
     wide = "<f8" if kind is pl.Float64 else dtype if dtype.endswith("8") else "<i8"
 
     def take(blocks: Sequence[Bytes]) -> Values:
+        """The numbers of all blocks, 64 bits wide."""
         return np.concatenate([rows.view(dtype)[:, 0] for rows in blocks], dtype=wide)
 
     return Field(kind, offset, offset + int(dtype[2:]), take)
@@ -142,6 +143,7 @@ def _always(value: pl.Series) -> Field:
     number = value.to_numpy() if value.dtype.is_numeric() and not value.null_count() else None
 
     def take(blocks: Sequence[Bytes]) -> Values:
+        """The value once for each message."""
         count = sum(map(len, blocks))
         return value.new_from_index(0, count) if number is None else number.repeat(count)
 
@@ -226,6 +228,7 @@ class Layout:
         starts = [stretch.start for stretch in self.stretches]
 
         def values(field: Field) -> Values:
+            """The values of one field, from the stretch that holds its bytes."""
             number = bisect_right(starts, field.start) - 1
             places = slice(field.start - starts[number], field.end - starts[number])
             return field.values([stretches[number][:, places] for stretches in blocks])

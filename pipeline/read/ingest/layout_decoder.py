@@ -93,6 +93,10 @@ class LayoutDecoder:
         yield _merged(heads, [(part, self._columns(part, heads)) for part in parts])
 
     def _by_layout(self, left: Messages, numbers: Ints, known: list[_Part]) -> None:
+        """Let messages of one length wait by their layouts; where none fits, one is learnt of the first message left.
+
+        `numbers`: of the messages among all that wait; `known`: the layouts of this length, extended here.
+        """
         tried = 0
         while len(left):
             if tried == len(known) and not self._learn(left, known):
@@ -112,6 +116,7 @@ class LayoutDecoder:
             tried += 1
 
     def _keep(self, part: _Part, numbers: Ints, rows: list[Bytes], usual: bool) -> None:
+        """Let messages of one layout wait: their numbers and, per stretch, their bytes (`rows`)."""
         part.numbers.append(numbers)
         part.stretches.append(rows)
         part.usual = part.usual and usual
@@ -133,6 +138,7 @@ class LayoutDecoder:
         self._keep(self._alone[-1], numbers[:1], layout.rows(messages.chosen(slice(1))), usual=True)
 
     def _layout_of_first(self, messages: Messages) -> Layout:
+        """The layout by walking the first message. Raises `InputError` where it cannot be decoded."""
         try:
             return self._walk(messages.payload(0))
         except UndecodableError as error:

@@ -82,6 +82,7 @@ def _origin(
 
 
 def _refuse_unknown_columns(stream: Stream, mapping: StreamMapping, contract: Mapping[str, dy.Column]) -> None:
+    """Raise `ConfigError` where a mapping names columns that the contract of its stream does not have."""
     named = {*mapping.fields, *mapping.constants, *mapping.factors}
     unknown = sorted(named - set(contract))
     if unknown:
@@ -108,6 +109,7 @@ def _coded(kind: str | None, path: str, mapping: StreamMapping) -> tuple[pl.Data
 
 
 def _constant(stream: Stream, mapping: StreamMapping, name: str, column: dy.Column) -> pl.Expr:
+    """The constant that a mapping gives for a column. Raises `ConfigError` where the column cannot hold it."""
     value = mapping.constants[name]
     words = column.categories if isinstance(column, dy.Enum) else None
     if isinstance(column, dy.Float64 | dy.Int64):  # to Python, true is a number as well

@@ -40,6 +40,7 @@ class Records:
 
     @cached_property
     def whole(self) -> Bytes:
+        """The bytes of all parts, one after the other; joined when first asked for."""
         return self.parts[0] if len(self.parts) == 1 else np.concatenate(self.parts)
 
 
@@ -79,10 +80,12 @@ class Messages:
     before: int = 0
 
     def __len__(self) -> int:
+        """Number of messages."""
         return len(self.start)
 
     @property
     def data(self) -> Bytes:
+        """The records of the block side by side, in which the payloads lie."""
         return self.records.whole
 
     @cached_property
@@ -102,6 +105,7 @@ class Messages:
         return stretches_of(self.data, self.start, end - start, start)
 
     def payload(self, row: int) -> bytes:
+        """The payload of the message with this number in the block."""
         return self.data[self.start[row] :][: self.length[row]].tobytes()
 
     def chosen(self, rows: Ints | Bools | slice) -> Messages:
@@ -155,6 +159,7 @@ class Allowance:
 
 
 def _refuse(damage: DamageError) -> None:
+    """Raise the damage: the way to treat an index that disagrees, unless another is given."""
     raise damage
 
 
@@ -283,6 +288,7 @@ def piece_of_messages(content: bytes, offset: int) -> Piece:
 
 
 def _walked(content: Any, starts: array[int], offset: int) -> Piece:
+    """The messages that begin at these places in the content, by channel; `offset`: of the content in the file."""
     data = np.frombuffer(content, dtype=np.uint8)
     at = np.array(starts, dtype=np.int64)
     if len(at) and (stretches_of(data, at + 1, 8).view("<i8") < _FIXED_FIELDS).any():

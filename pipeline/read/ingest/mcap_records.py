@@ -28,6 +28,8 @@ class DamageError(Exception):
 
 @frozen
 class Schema:
+    """A schema record: how the messages of a channel are written; `data` in the language that `encoding` names."""
+
     id: int
     name: str
     encoding: str
@@ -47,14 +49,17 @@ class Channel:
 
     @property
     def place(self) -> str:
+        """File and topic, for error messages."""
         return f"{self.file}: topic {self.topic}"
 
     @property
     def schema_name(self) -> str:
+        """Name of the schema; empty where the channel has none."""
         return self.schema.name if self.schema else ""
 
     @property
     def schema_encoding(self) -> str:
+        """Language of the schema (`protobuf`, `ros2msg`); empty where the channel has none."""
         return self.schema.encoding if self.schema else ""
 
 
@@ -73,6 +78,7 @@ class _Stream(ReadDataStream):
         self._count = 0
 
     def read(self, length: int) -> Any:
+        """The next bytes of the record; a view where they are many. Raises `EndOfFile` where fewer are left."""
         content = self._record[self._count :][:length]
         if len(content) < length:
             raise EndOfFile
@@ -80,17 +86,21 @@ class _Stream(ReadDataStream):
         return content if length > _LARGE else bytes(content)
 
     def _number(self, kind: Struct) -> int:
+        """The next integer, of this kind."""
         value: int = kind.unpack_from(self._record, self._count)[0]
         self._count += kind.size
         return value
 
     def read2(self) -> int:
+        """The next unsigned integer of 16 bits."""
         return self._number(_U16)
 
     def read4(self) -> int:
+        """The next unsigned integer of 32 bits."""
         return self._number(_U32)
 
     def read8(self) -> int:
+        """The next unsigned integer of 64 bits."""
         return self._number(_U64)
 
 

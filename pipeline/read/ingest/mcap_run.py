@@ -46,6 +46,7 @@ class McapStreams:
         self.readers: dict[int, list[SourceReader]] = {}
 
     def add(self, block: Block, channels: Mapping[int, Channel]) -> None:
+        """Hand the messages of a block to the readers of their channels. Raises `InputError` for one too large."""
         for channel_id, messages in block.items():
             readers = self.readers.get(channel_id)
             if readers is None:
@@ -62,6 +63,7 @@ class McapStreams:
             reader.decode()
 
     def _readers(self, messages: Messages, channel: Channel) -> list[SourceReader]:
+        """The readers of a channel, chosen by its first messages; none where it feeds no stream."""
         if not is_candidate(channel, self._config):
             return []
         if sum(map(bool, self.readers.values())) >= MOST_TOPICS:
@@ -78,6 +80,7 @@ class McapStreams:
 
 
 def _check_sizes(messages: Messages, channel: Channel) -> None:
+    """Refuse messages of more than `LARGEST_MESSAGE` bytes."""
     if messages.longest > LARGEST_MESSAGE:
         raise InputError(
             f"has a message of {messages.longest} bytes",
@@ -190,6 +193,7 @@ class _Sinks:
         self._sinks = sinks
 
     def add(self, block: Block, channels: Mapping[int, Channel]) -> None:
+        """Show the messages of a block to each of them."""
         for sink in self._sinks:
             sink.add(block, channels)
 
@@ -277,6 +281,7 @@ def _held(sources: Sequence[Source], place: str) -> tuple[StreamCorrection, ...]
 
 
 def _no_gnss(logs: Sequence[_WalkedLog], left_over: tuple[str, ...]) -> InputError:
+    """The error for logs without a GNSS stream: cut off before any message, or with these topics left over."""
     place = ", ".join(str(log.path) for log in logs)
     walk = logs[0].walk
     if walk.cut_at is not None and not any(log.walk.met.message_counts for log in logs):

@@ -23,6 +23,7 @@ class ChunkList:
     contents: array[int] = field(default_factory=lambda: array("q"))
 
     def __len__(self) -> int:
+        """Number of chunks."""
         return len(self.offsets)
 
     def add(self, of: Chunk | ChunkIndex, offset: int, record: int, with_indexes: int) -> None:
@@ -34,9 +35,11 @@ class ChunkList:
         self.contents.append(hash(content))
 
     def is_same(self, other: ChunkList) -> bool:
+        """Whether both list the same chunks at the same places."""
         return (self.offsets, self.contents) == (other.offsets, other.contents)
 
     def sorted(self) -> ChunkList:
+        """The chunks in order of their places in the file."""
         order = sorted(range(len(self)), key=self.offsets.__getitem__)
         columns = (self.offsets, self.lengths, self.contents)
         return ChunkList(*(array("q", map(column.__getitem__, order)) for column in columns))
@@ -98,6 +101,7 @@ class WalkCounts:
         self.orphans.append((len(self.chunks), damage))
 
     def add_times(self, low_ns: int, high_ns: int) -> None:
+        """Widen the span of log times by these, the earliest and the latest of a block [ns]."""
         old = self.span_ns or (low_ns, high_ns)
         self.span_ns = (min(old[0], low_ns), max(old[1], high_ns))
 
@@ -161,6 +165,7 @@ class Summary:
                 raise DamageError(position, f"the statistics record gives {recorded} {name}, the file holds {counted}")
 
     def _topic(self, channel_id: int) -> str:
+        """The topic of a channel, or its number where the channel is not known."""
         return self._channels[channel_id].topic if channel_id in self._channels else f"channel {channel_id}"
 
     def finish(self, footer: bytes, position: int) -> None:
@@ -192,8 +197,10 @@ class Summary:
 
 
 def _is_less(counts: Mapping[int, int], stated: Mapping[int, int]) -> bool:
+    """Whether no channel has more messages than stated."""
     return all(count <= stated.get(channel, 0) for channel, count in counts.items())
 
 
 def _loss(what: str, held: int, declared: int) -> str:
+    """A loss in words: how many are held of those that are declared."""
     return f"{held} of {declared} {what} that are declared"

@@ -116,6 +116,7 @@ class McapWalk:
             raise contradiction
 
     def _walked(self) -> Iterator[Block]:
+        """The messages in blocks, record by record to the end, a cut, or damage."""
         position = self._first_record()
         while position is not None:
             head = self._head(position)
@@ -126,6 +127,7 @@ class McapWalk:
                 yield self._block()
 
     def _read(self, position: int, length: int) -> bytes:
+        """So many bytes of the file from a position on. Raises `OSError` where the file has become shorter."""
         self._stream.seek(position)
         content = self._stream.read(length)
         if len(content) < length:
@@ -133,6 +135,7 @@ class McapWalk:
         return content
 
     def _first_record(self) -> int | None:
+        """Position of the Header behind the magic bytes; none where the file is cut off before it ends."""
         if self._size == 0:
             raise DamageError(0, "the file is empty")
         start = self._read(0, min(self._size, len(MAGIC)))
@@ -188,6 +191,7 @@ class McapWalk:
         return position + HEAD_SIZE + length
 
     def _of_data(self, opcode: int, body: bytes, position: int) -> None:
+        """Meet a record that is read whole: a definition, the Header, or the end of the data section."""
         if opcode in (Opcode.SCHEMA, Opcode.CHANNEL):
             self._definition(opcode, body, position)
         elif opcode == Opcode.HEADER:
@@ -211,6 +215,7 @@ class McapWalk:
             self._known.add(key)
 
     def _schema(self, body: bytes, position: int) -> None:
+        """Remember a schema; defined again, it must be the same."""
         record = parse(records.Schema, body, position)
         if record.id == 0:
             raise DamageError(position, "a Schema record has the id 0")
@@ -219,6 +224,7 @@ class McapWalk:
             raise DamageError(position, f"schema {schema.id} is defined twice with different content")
 
     def _channel(self, body: bytes, position: int) -> None:
+        """Remember a channel; its schema must be known, and defined again, it must be the same."""
         record = parse(records.Channel, body, position)
         schema = self._schemas.get(record.schema_id)
         notes = tuple(noted(record.metadata).items())
@@ -282,6 +288,7 @@ class McapWalk:
         return self._loose_until
 
     def _keep(self, piece: Piece) -> None:
+        """Let the messages of a piece wait until there are enough for a block."""
         self._pieces.append(piece)
         self._waiting += max(piece.size, _LEAST_PIECE)
 
@@ -374,6 +381,7 @@ class McapWalk:
 
 
 def _check_size(what: str, size: int, limit: int, position: int) -> None:
+    """Raise `DamageError` where something declares more bytes than the limit."""
     if size > limit:
         over = f"over the limit of {limit} ([ingest] chunk_limit_mib)"
         raise DamageError(position, f"{what} declares {size} bytes, {over}")

@@ -121,6 +121,7 @@ def _read_stream(
 
 
 def _unreadable(error: ParquetError, place: str) -> InputError:
+    """The breach for a file that is no whole Parquet file."""
     return InputError(f"cannot be read as Parquet ({error})", place=place, remedy="Record or copy the file again.")
 
 

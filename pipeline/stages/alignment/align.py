@@ -79,7 +79,7 @@ def alignment(
     if odometry is None:
         return Alignment(_without_odometer(positions, allowed, vehicle, config))
     # A position that has jumped aside is still compared: that is how the monitors see the jump.
-    along_m = unrolled(positions)
+    along_m = curve_corrected_path_m(positions)
     jitter_s = stamp_jitter_s(
         odometry.seconds(positions.t_ns), periods_before_s(positions.t_ns), config.align.clock_periods
     )
@@ -140,7 +140,7 @@ def _allowed(positions: MatchedEpochs, config: Configuration) -> _Allowed:
     )
 
 
-def unrolled(epochs: MatchedEpochs) -> Floats:
+def curve_corrected_path_m(epochs: MatchedEpochs) -> Floats:
     """Path position less what a curve adds to the movement of a position off the track's axis [m]; NaN off the track.
 
     A point y to the left of a track with left curvature k moves dx / (1 - k y) along it while the train moves dx.

@@ -119,7 +119,7 @@ class _Learner:
         self._sigma_m = np.hypot(self._calibrated_m, self._digits_m)
         self._t_ns = t_ns[self._rows]
         self._t_s = t_s[self._rows]
-        self._doubt_m = odometry.doubt_at_s(self._t_s)
+        self._doubt_m = odometry.cumulative_doubt_m(self._t_s)
         # Single times are looked up in a list, which is several times faster than in an array.
         self._times: list[float] = self._t_s.tolist()
         self._jitter_s = positions.jitter_s[self._rows]
@@ -177,7 +177,7 @@ class _Learner:
             state, new_from, new_joints = self._updates(state, row, end)
             use_from = np.concatenate([use_from[current:], new_from])
             joints = np.concatenate([joints[current:], new_joints])
-            self._put(np.maximum(use_from, row), joints)
+            self._fill_estimates(np.maximum(use_from, row), joints)
             series = self._series(row, end, begin)
             value, sigma, bank = run_axis(series, self._alphas, bank, self._meter.variance_m2(row, end))
             beyond = ~(np.abs(value) <= self._factor * sigma)  # what cannot be compared is no pass
@@ -185,7 +185,7 @@ class _Learner:
             if failing.size:
                 alarm = row + int(failing[0])
                 held = joints[_in_use(use_from, alarm)]
-                self._put(np.array([alarm]), held[None])
+                self._fill_estimates(np.array([alarm]), held[None])
                 # The block's last state may lie behind the alarm: what it has to settle is not carried over.
                 return FilterState(held, self._times[alarm], state.origin_m), alarm
             row = end
@@ -194,7 +194,7 @@ class _Learner:
 
     def _updates(self, state: FilterState, begin: int, end: int) -> tuple[FilterState, Ints, Floats]:
         """The filter over rows [begin, end): its last state, first use of each joint state, joint states."""
-        due = self._due(state.t_s, begin, end)
+        due = self._update_rows(state.t_s, begin, end)
         before = np.concatenate([[self._next(state.t_s, 0)], due])[:-1]
         broken = (self._doubt_m[before] != self._doubt_m[due]) | (self._breaks[before] != self._breaks[due])
         joints = np.empty((due.size, *state.joint.shape))
@@ -206,7 +206,7 @@ class _Learner:
             part = due[first:last]
             observed = self._t_s[part], self._path_m[part], self._sigma_m[part]
             joints[first:last] = self._filter.run(state, *observed, self._jitter_s[part])
-            state = self._filter.after(state, joints[last - 1], float(self._t_s[part[-1]]))
+            state = self._filter.state_after(state, joints[last - 1], float(self._t_s[part[-1]]))
         # An update reads the odometer up to `latency_span_s` after its epoch: causal is its use from then on.
         use_from = np.searchsorted(self._t_s, self._t_s[due] + self._config.align.latency_span_s)
         return state, np.maximum(use_from, due + 1), joints
@@ -219,8 +219,8 @@ class _Learner:
         away = self._outages[before] != self._outages[row]
         return self._filter.restart(state, *self._observation(row), self._moved_m**2 if away else 0.0)
 
-    def _due(self, last_s: float, begin: int, end: int) -> Ints:
-        """Rows of the updates: a filter period apart."""
+    def _update_rows(self, last_s: float, begin: int, end: int) -> Ints:
+        """Rows of [begin, end) at which the filter is updated: a filter period apart, the first after `last_s` [s]."""
         period_s = self._config.align.filter_period_s * (1.0 - 1e-6)
         due: list[int] = []
         row = self._next(last_s + period_s, begin)
@@ -229,10 +229,10 @@ class _Learner:
             row = self._next(self._times[row] + period_s, row + 1)
         return np.array(due, dtype=np.int64)
 
-    def _put(self, use_from: Ints, joints: Floats) -> None:
-        """Fill the estimates in use, each from its row on."""
+    def _fill_estimates(self, use_from: Ints, joints: Floats) -> None:
+        """Enter the estimates of these joint states into the result, each from the row `use_from` on."""
         epochs = np.append(self._rows, self._learned.scale.size)  # a row past the last is past all epochs
-        self._learned.put(epochs[use_from], estimates_of(joints))
+        self._learned.fill(epochs[use_from], estimates_of(joints))
 
     def _next(self, t_s: float, at_least: int) -> int:
         """The first row from `at_least` on that is not before a time."""
@@ -258,7 +258,7 @@ class _Learner:
             period_s=read.period_s,
         )
         odometer = self._odometry.increments(self._t_ns[part], in_use.scale, in_use.latency_s, read)
-        return along_series(epochs, odometer, self._config).between(begin - part.start, end - part.start)
+        return along_series(epochs, odometer, self._config).rows_between(begin - part.start, end - part.start)
 
     def _hold(self, scale_sigma: float, alarm: int) -> tuple[int, float]:
         """Row from which learning goes on after the alarm, and what the offset has still to settle by [m^2].

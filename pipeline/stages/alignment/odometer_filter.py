@@ -44,8 +44,8 @@ class Estimates(NamedTuple):
         """The estimates at some epochs."""
         return Estimates(*(column[rows] for column in self))
 
-    def put(self, begins: Ints, changes: Estimates) -> None:
-        """Each change holds from its epoch to the next, the last for good."""
+    def fill(self, begins: Ints, changes: Estimates) -> None:
+        """Overwrite from epoch `begins[i]` on by change i: each holds up to the next begin, the last to the end."""
         lengths = np.diff(begins, append=self.scale.size)
         for column, value in zip(self, changes, strict=True):
             column[begins[0] :] = np.repeat(value, lengths)
@@ -110,7 +110,11 @@ def _scatters(known: KnownNoise, jitter_s: Floats) -> list[_Scatter]:
 
 @frozen
 class ScaleLatencyFilter:
-    """States are passed in and out."""
+    """Extended Kalman filter of offset, scale error, latency and errors e_j; states are passed in and out.
+
+    `shares`, `taus_s`: part of the variance and correlation time of each error e_j; times are seconds since the
+    odometer's `epoch_ns`, path positions metres.
+    """
 
     shares: Floats
     taus_s: Floats
@@ -127,7 +131,7 @@ class ScaleLatencyFilter:
         return FilterState(np.column_stack([covariance, mean]), t_s, origin_m)
 
     def restart(self, state: FilterState, t_s: float, path_m: float, unsettled_m2: float = 0.0) -> FilterState:
-        """The same, but what was learned of scale and latency stays."""
+        """As `start`, but what was learned of scale and latency stays; `unsettled_m2`: the offset has still to walk."""
         fresh = self.start(estimates_of(state.joint), t_s, path_m)
         kept = slice(_SCALE, _ERRORS)
         fresh.joint[kept, kept] = state.joint[kept, kept]
@@ -157,8 +161,8 @@ class ScaleLatencyFilter:
         joint[_OFFSET, _OFFSET] += brought_m2
         return FilterState(joint, t_s, state.origin_m, left_m2 + brought_m2)
 
-    def after(self, state: FilterState, joint: Floats, t_s: float) -> FilterState:
-        """The state after an epoch, with what has settled since."""
+    def state_after(self, state: FilterState, joint: Floats, t_s: float) -> FilterState:
+        """The state at the epoch `t_s` [s]: its updated `joint`, and less left to settle than in the `state` before."""
         return state._replace(joint=joint, t_s=t_s, unsettled_m2=self._unsettled_m2(state, t_s))
 
     def run(self, state: FilterState, t_s: Floats, path_m: Floats, sigma_m: Floats, jitter_s: Floats) -> Floats:

@@ -186,7 +186,7 @@ def orient_stretch(stretch: ReferenceStretch, counter: SignedOdometer | None, le
     begin, end, step_m = _movements_beyond_noise(stretch)
     counted_m = np.abs(step_m)
     if counter is not None:
-        counted_m = counter.odometer.proved_between(stretch.t_ns[begin], stretch.t_ns[end])
+        counted_m = counter.odometer.proved_distance_between(stretch.t_ns[begin], stretch.t_ns[end])
         counted_m = np.where(np.abs(step_m) > 0.5 * np.abs(counted_m), counted_m, 0.0)
     sense = relative_sense(counted_m, step_m, least_m)
     shared_m = sense * shared_movement_m(counted_m, step_m)

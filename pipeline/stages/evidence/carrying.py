@@ -65,20 +65,22 @@ class SignedOdometer:
         """Whether scale and its sigma are those of a vehicle file."""
         return self.odometer.scale is not None
 
-    def between(self, begin_ns: Ints | int, end_ns: Ints) -> OdometerDistance:
+    def distance_and_variance(self, begin_ns: Ints | int, end_ns: Ints) -> OdometerDistance:
         """True distance between instants, its variance and bound; NaN over a break.
 
         Args:
             begin_ns: instants from which, one or as many as `end_ns` [ns].
             end_ns: instants to which [ns], shape (n,).
         """
-        counted = self.odometer.between(begin_ns, end_ns)
+        counted = self.odometer.distance_and_variance(begin_ns, end_ns)
         known = self._are_unbroken(begin_ns, end_ns) & (counted.bound_m <= self.doubt_limit_m)
         return counted._replace(distance_m=np.where(known, counted.distance_m, np.nan))
 
     def undoubted_distance_m(self, begin_ns: Ints | int, end_ns: Ints) -> Floats:
         """Distance between instants where nothing of it is in doubt [m]; NaN over slip, pauses and resets too."""
-        return np.where(self._are_unbroken(begin_ns, end_ns), self.odometer.proved_between(begin_ns, end_ns), np.nan)
+        return np.where(
+            self._are_unbroken(begin_ns, end_ns), self.odometer.proved_distance_between(begin_ns, end_ns), np.nan
+        )
 
     @cached_property
     def counter_rows(self) -> CounterRows:
@@ -154,7 +156,7 @@ def _carry_from(
     config: Configuration,
 ) -> Interval:
     """The interval of a place known to `known_m`, plus the distance since `since_ns`, +- (5 % + bound)."""
-    distance = counter.between(since_ns, t_ns)
+    distance = counter.distance_and_variance(since_ns, t_ns)
     centre = at_m + distance.distance_m
     half = known_m + config.lds.odometer_share * counter.driven_between_m(since_ns, t_ns) + distance.bound_m
     return centre - half, centre + half
@@ -175,7 +177,7 @@ def carry_between_anchors(
     """
     factor = config.hazards.evidence_factor
     clock_m = [_anchor_doubt_m(counter, anchor, t_ns) for anchor in anchors]
-    distances = [counter.between(anchor.t_ns, t_ns) for anchor in anchors]
+    distances = [counter.distance_and_variance(anchor.t_ns, t_ns) for anchor in anchors]
     places = [at + distance.distance_m for at, distance in zip(at_m, distances, strict=True)]
     variances = [anchor.sigma_m**2 + distance.variance_m2 for anchor, distance in zip(anchors, distances, strict=True)]
     closed = odometer_closes(counter, anchors, at_m[1] - at_m[0], config)
@@ -226,7 +228,7 @@ def odometer_closes(
     """Whether the odometer's distance is that of the anchors: within k combined sigmas, without a file 5 m + 5 %."""
     begin, end = anchors
     end_ns = np.array([end.t_ns])
-    distance = counter.between(begin.t_ns, end_ns)
+    distance = counter.distance_and_variance(begin.t_ns, end_ns)
     root = np.sqrt(begin.sigma_m**2 + end.sigma_m**2 + distance.variance_m2)
     limit = config.hazards.evidence_factor * root
     if not counter.has_known_scale:
@@ -423,7 +425,7 @@ def measure_lags(
         return Lags((found,))
     # Movements that follow one another share the noise of the place between them: together as if each had twice its
     # variance.
-    variance_m2 = 2.0 * sigma_m**2 + np.nan_to_num(counter.between(begin_ns, end_ns).variance_m2)
+    variance_m2 = 2.0 * sigma_m**2 + np.nan_to_num(counter.distance_and_variance(begin_ns, end_ns).variance_m2)
     factor = config.hazards.evidence_factor
     scale_off = factor * (counter.odometer.scale_sigma or 0.0) if counter.has_known_scale else config.lds.odometer_share
     movements = (begin_s, end_s, moved_m)

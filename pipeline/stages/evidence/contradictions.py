@@ -409,7 +409,7 @@ def _differences_m(
     whole = known.path.leg[begin] == known.path.leg[end]
     for number, witness in enumerate(witnesses):
         t_ns = stretch.t_ns - round(witness.lag_s * NS_PER_S)
-        distance = witness.counter.between(t_ns[begin], t_ns[end])
+        distance = witness.counter.distance_and_variance(t_ns[begin], t_ns[end])
         # Others may count with the other sign.
         least_m = config.matching.orientation_distance_m
         sense = relative_sense(distance.distance_m, moved_m, least_m) if number else known.sense

@@ -96,11 +96,11 @@ class TrainEvidence:
 
     `off_track`: times with reference samples that lie on no track. `carried`: by each odometer from reads and the ends
     of the reference, outside its time; `by_reads`: from reads alone, over the whole run. `standstills`: times over
-    which the odometer carries nothing from one side. `stands`: ends of recordings at which the train stood; `parted`:
-    an odometer of unknown origin parts from an independent one; `doubted`: steps and drifts of the reference that an
-    odometer or a read contradicts, and clocks that change; `unsure`: times in which nobody knows which of the two
-    failed; `disputes`: times about reads that exclude the reference; `true_clocks_s`: by how much the odometer's stamps
-    may be early.
+    which the odometer carries nothing from one side. `stands`: ends of recordings at which the train stood;
+    `odometers_disagree`: one of unknown origin parts from an independent one; `contradiction_count`: steps and drifts
+    of the reference that an odometer or a read contradicts, and clocks that change; `unsure`: times in which nobody
+    knows which of the two failed; `disputes`: times about reads that exclude the reference; `true_clocks_s`: by how
+    much the odometer's stamps may be early.
     """
 
     stretches: tuple[KnownStretch, ...]
@@ -113,8 +113,8 @@ class TrainEvidence:
     config: Configuration
     standstills: tuple[Span, ...] = ()
     stands: tuple[FinalStand, ...] = ()
-    parted: bool = False
-    doubted: int = 0
+    odometers_disagree: bool = False
+    contradiction_count: int = 0
     unsure: tuple[Span, ...] = ()
     disputes: tuple[Span, ...] = ()
     true_clocks_s: tuple[float, ...] = (0.0,)

@@ -145,7 +145,7 @@ class GapSearch:
         if end.t_ns < begin.t_ns:
             return []
         end_ns = np.array([end.t_ns])
-        counted = self.counter.between(begin.t_ns, end_ns)
+        counted = self.counter.distance_and_variance(begin.t_ns, end_ns)
         length_m, bound_m = float(counted.distance_m[0]), float(counted.bound_m[0])
         if np.isnan(length_m):
             return [Gap(begin.t_ns, end.t_ns, begin, None, []), Gap(begin.t_ns, end.t_ns, None, end, [])]
@@ -180,7 +180,7 @@ class GapSearch:
         gaps = self._gaps_between(begin, end)
         if len(gaps) != 1 or not gaps[0].routes:
             return 0.0
-        counted = self.counter.between(begin.t_ns, np.array([end.t_ns]))
+        counted = self.counter.distance_and_variance(begin.t_ns, np.array([end.t_ns]))
         counted_m = float(counted.distance_m[0])
         variance_m2 = begin.sigma_m**2 + end.sigma_m**2 + float(counted.variance_m2[0])
         allowed_m = self.config.align.sure_sigmas * float(np.sqrt(variance_m2 + (scale_sigma * counted_m) ** 2))
@@ -267,7 +267,7 @@ class GapSearch:
 
     def _may_have_turned(self, gap: Gap, looks_ns: Ints) -> bool:
         """Whether the train went back in the gap by more than the fixed error of the odometer."""
-        distance_m = self.counter.between(gap.anchors[0].t_ns, looks_ns).distance_m
+        distance_m = self.counter.distance_and_variance(gap.anchors[0].t_ns, looks_ns).distance_m
         distance_m = distance_m[np.isfinite(distance_m)]
         # The largest fall behind the farthest place so far; a run without a turn has none in one of the two senses.
         senses = (distance_m, -distance_m)

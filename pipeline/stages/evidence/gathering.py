@@ -263,11 +263,11 @@ def evidence_of(
         network=network,
         config=config,
         stands=final_stands([stretch.reference for stretch in known], independent, config),
-        parted=_odometers_disagree(odometers, config),
+        odometers_disagree=_odometers_disagree(odometers, config),
         unsure=tuple(unsure),
         true_clocks_s=possible_leads_s((of_reference,) * bool(known) + _clocks_in_use(of_others, by_recorder)),
         disputes=tuple(span for stretch in recorded for span in stretch.disputed),
-        doubted=unclosed
+        contradiction_count=unclosed
         + sum(stretch.levels.count_doubted_steps for stretch in recorded)
         + (0 if counters else sum(len(stretch.disputed) for stretch in recorded))
         + sum(len(of_one.found) > 1 for of_one in lags),

@@ -32,7 +32,13 @@ class Journey:
     """
 
     def __init__(self, epochs: AlignedEpochs, scale_sigma: float | None, config: Configuration) -> None:
-        """The only place where the LDS reads columns of aligned epochs."""
+        """Read the columns of aligned epochs, which the LDS does nowhere else.
+
+        Args:
+            epochs: aligned epochs of one solution, in order of time.
+            scale_sigma: standard deviation of the odometer's scale; None where it is not known.
+            config: the configuration; used is `lds`.
+        """
         self.t_ns = epochs.t_ns
         self.leg: Ints = _last_known(epochs.leg, epochs.leg >= 0, 0)
         self.path_m = epochs.path_m
@@ -291,6 +297,7 @@ class Disarmed:
         self._at: dict[str, tuple[Balise, float]] = {}
 
     def __bool__(self) -> bool:
+        """Whether any balise is disarmed."""
         return bool(self._at)
 
     def holds(self, balise: Balise) -> bool:
@@ -298,6 +305,7 @@ class Disarmed:
         return balise.balise_id in self._at
 
     def add(self, crossing: Crossing) -> None:
+        """Disarm the balise of a crossing from there on."""
         odometer_m = float("nan") if crossing.odometer_m is None else crossing.odometer_m
         self._at[crossing.balise.balise_id] = (crossing.balise, odometer_m)
 

@@ -78,7 +78,7 @@ def find_path(
         counted_m = (odometry.scale or 1.0) * odometry.distance_at(at_ns)
         since_m = np.full(states.step.size, np.nan)
         since_m[1:] = odometry.distance_between(at_ns[states.step[:-1]], at_ns[states.step[1:]])
-        doubt_m = odometry.doubt_at_s(odometry.seconds(at_ns))
+        doubt_m = odometry.cumulative_doubt_m(odometry.seconds(at_ns))
         moves = Moves(network, found.steps, counted_m, doubt_m, polarity_of_parts(network, states, since_m), config)
     course = least_squares_course(states, moves)
     decoded = with_direction_kept(moves, course, split_into_legs(course, moves))

@@ -25,7 +25,10 @@ _STRAIGHT_PER_M = 1e-6
 
 @frozen
 class Axis:
-    """Its increments, at which of them the train moves, and per epoch why there is none (`NO_REASON`: there is)."""
+    """One axis of the bank, `along`, `cross` or `up`: its increments, and at which of them the train moves.
+
+    `reasons`: per epoch why it has no increment (`NO_REASON`: it has one).
+    """
 
     name: str
     series: AxisSeries
@@ -35,7 +38,7 @@ class Axis:
 
     @cached_property
     def _sampler(self) -> Sampler:
-        """What all meters of its noise look at."""
+        """The second differences of the series, shared by all meters of its noise."""
         return Sampler(self.series, self.moving, self.config.monitors)
 
     def noise_meter(self, given_m: tuple[float, ...] | None) -> NoiseMeter:
@@ -95,7 +98,7 @@ def _match_reasons(epochs: AlignedEpochs) -> Ints:
 
 
 def _along(epochs: AlignedEpochs, t_s: Floats, reasons: Ints, config: Configuration) -> AxisSeries:
-    """The epochs that are compared along the track, and what they are compared by."""
+    """Increments of GNSS minus odometer along the track, of the epochs without a reason (`NO_REASON`); `t_s`: [s]."""
     rows = np.flatnonzero(reasons == NO_REASON)
     at_rows = AlongEpochs(
         epoch=rows,
@@ -117,7 +120,10 @@ def _along(epochs: AlignedEpochs, t_s: Floats, reasons: Ints, config: Configurat
 def _across(
     epochs: AlignedEpochs, t_s: Floats, reasons: Ints, axis: Literal["cross", "up"], config: Configuration
 ) -> AxisSeries:
-    """Cross-track or vertical; the chord error of a coarse survey is one more correlated source."""
+    """Increments of the cross-track or vertical deviation, of the epochs without a reason (`NO_REASON`).
+
+    The chord error of a coarse survey is one more correlated source.
+    """
     rows = np.flatnonzero(reasons == NO_REASON)
     dt, fresh = time_steps(t_s[rows], config.align.gap_reset_s)
     visit = np.cumsum(np.diff(epochs.element, prepend=epochs.element[:1]) != 0)[rows]

@@ -219,8 +219,8 @@ class AxisSeries:
     border_m2: Floats
     lasting_mps: Floats
 
-    def between(self, low: int, high: int) -> AxisSeries:
-        """Its rows [low, high)."""
+    def rows_between(self, low: int, high: int) -> AxisSeries:
+        """The series of its rows [low, high) alone."""
         parts = {item.name: getattr(self, item.name)[low:high] for item in fields(self)}
         if self.sigma_before_m is self.sigma_m:
             parts["sigma_before_m"] = parts["sigma_m"]

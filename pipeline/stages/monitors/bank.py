@@ -80,7 +80,7 @@ class AxisBank:
         while self._done < rows.size and rows[self._done] <= epoch:
             end = min(self._done + self._block, rows.size)
             self._last_block = self._done, self._state
-            part = self.series.between(self._done, end)
+            part = self.series.rows_between(self._done, end)
             noise_m2 = self._meter.variance_m2(self._done, end)
             value, sigma, self._state = run_axis(part, self._alphas, self._state, noise_m2)
             self._store(part, value, self._config.monitors.threshold_factor * sigma, np.sqrt(noise_m2))

@@ -34,8 +34,14 @@ class NoiseMeter:
         config: Configuration,
         sampler: Sampler | None = None,
     ):
-        """`series`: of the whole run; `given_m`: by monitor, replaces what is measured; `sampler`: of the series, where
-        another meter made one.
+        """Prepare the second differences of all lags, unless the noise is given.
+
+        Args:
+            series: increments of the axis over the whole run, n rows.
+            moving: whether the train moves at each of them, shape (n,).
+            given_m: deviation of the noise by monitor (raw, then the EWMAs) [m]; replaces what is measured.
+            config: the configuration; used is `monitors`.
+            sampler: of the same series, where another meter made one.
         """
         self._series = series
         self._config = config.monitors
@@ -59,7 +65,7 @@ class NoiseMeter:
             self._entering[index] = entering[: np.searchsorted(samples.row[entering], row)]
 
     def restart(self, row: int) -> None:
-        """Samples count again whose three rows all lie at this row or after it."""
+        """From this row on samples enter the noise again, those whose three rows all lie at it or after it."""
         self.freeze(row)
         for index, samples in enumerate(self._samples):
             later = np.arange(np.searchsorted(samples.oldest, row), samples.row.size)

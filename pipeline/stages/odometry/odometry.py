@@ -53,12 +53,12 @@ class Odometry:
     """Distance over time with its noise and two sums of doubt.
 
     Instants are int64 nanoseconds; `t_s` (rows, and what was filled in) and all `_s` arguments are seconds since
-    `epoch_ns`. Distances are as recorded, but for `between` and `increments`. `doubt_m`: by how much the distance may
-    be off as the train itself believes it, a sum, `LOST_M` more where it was lost. `pause[i]`: between samples i and
-    i+1 nothing is interpolated. `scale`: true over recorded distance, None without its sigma. `leaps_ns`: rows to which
-    the counter leaps; `bridged_m2`: variance over bridged ones, a sum. `bound`: by how much the distance may be off as
-    braking proves it. `period_s`: usual time between rows of the run, for words about it. `origin`: as declared;
-    `follows_gnss`: found to be made of the positions all the same.
+    `epoch_ns`. Distances are as recorded, but for those between instants and `increments`. `doubt_m`: by how much the
+    distance may be off as the train itself believes it, a sum, `LOST_M` more where it was lost. `pause[i]`: between
+    samples i and i+1 nothing is interpolated. `scale`: true over recorded distance, None without its sigma.
+    `leaps_ns`: rows to which the counter leaps; `bridged_m2`: variance over bridged ones, a sum. `bound`: by how much
+    the distance may be off as braking proves it. `period_s`: usual time between rows of the run, for words about it.
+    `origin`: as declared; `follows_gnss`: found to be made of the positions all the same.
     """
 
     epoch_ns: int
@@ -100,8 +100,8 @@ class Odometry:
         """The last row, rounded up."""
         return self.epoch_ns + int(np.ceil(self.t_s[-1] * 1e9))
 
-    def oriented(self, sign: int) -> Odometry:
-        """Growing with the path; `sign` is +1 or -1."""
+    def growing_along_path(self, sign: int) -> Odometry:
+        """The odometer, its distance growing with the path; `sign`: +1 where the recorded one does, -1 if it falls."""
         return self if sign > 0 else replace(self, distance_m=-self.distance_m)
 
     def seconds(self, t_ns: Ints) -> Floats:
@@ -113,11 +113,11 @@ class Odometry:
         return self.known_at_s(self.seconds(t_ns))
 
     def slips_at_s(self, t_s: Floats) -> Bools:
-        """Whether the sample before or after is slip."""
+        """Whether the sample before or after each instant reports slip."""
         return self.read(t_s).slips
 
-    def doubt_at_s(self, t_s: Floats) -> Floats:
-        """Distances compare to a millimetre where it is the same, and not at all across a loss (`is_lost`) [m]."""
+    def cumulative_doubt_m(self, t_s: Floats) -> Floats:
+        """`doubt_m` at each instant [m]: distances at instants of the same doubt compare, across a loss never."""
         return self.read(t_s).doubt_m
 
     def distance_at(self, t_ns: Ints) -> Floats:
@@ -130,7 +130,7 @@ class Odometry:
         return self._travelled_at_s(self.seconds(t_ns))
 
     def _travelled_at_s(self, t_s: Floats) -> Floats:
-        """The same at instants in seconds."""
+        """`travelled_at` by instants in seconds since `epoch_ns` [m]."""
         return np.interp(t_s, self.t_s, self._travelled_m)
 
     def moving_s_at(self, t_ns: Ints) -> Floats:
@@ -142,19 +142,22 @@ class Odometry:
         return np.diff(self.moving_s_at(t_ns)) > 0.5 * np.diff(t_ns) / NS_PER_S
 
     def drove(self, begin_ns: Ints | int, end_ns: Ints, noise_m: Floats | float = 0.0) -> Bools:
-        """Whether the train is farther from its place than dead band and noise; not where that is in doubt."""
-        return np.abs(np.nan_to_num(self.proved_between(begin_ns, end_ns))) > self._still_m(begin_ns, end_ns) + noise_m
+        """Whether the train is farther from its place at `begin_ns` than dead band and `noise_m`; False in doubt."""
+        return (
+            np.abs(np.nan_to_num(self.proved_distance_between(begin_ns, end_ns)))
+            > self._still_m(begin_ns, end_ns) + noise_m
+        )
 
     def was_at_standstill(self, begin_ns: Ints | int, end_ns: Ints) -> Bools:
-        """Whether it is no farther from its place than the dead band; not where that is in doubt."""
-        still: Bools = np.abs(self.proved_between(begin_ns, end_ns)) <= self._still_m(begin_ns, end_ns)
+        """Whether it is no farther from its place at `begin_ns` than the dead band; not where that is in doubt."""
+        still: Bools = np.abs(self.proved_distance_between(begin_ns, end_ns)) <= self._still_m(begin_ns, end_ns)
         return still
 
     def _still_m(self, begin_ns: Ints | int, end_ns: Ints) -> Floats:
         """What a wheel may move unnoticed in a time, below the speed that counts as standstill [m]."""
         return np.asarray(self.deadband_mps * np.abs(end_ns - begin_ns) / NS_PER_S)
 
-    def between(self, begin_ns: Ints | int, end_ns: Ints) -> OdometerDistance:
+    def distance_and_variance(self, begin_ns: Ints | int, end_ns: Ints) -> OdometerDistance:
         """True distance between instants, and its variance.
 
         s D, and s^2 (white noise over the time in which the train moved, quantisation noise of both rows) + (sigma_s
@@ -182,25 +185,25 @@ class Odometry:
         return OdometerDistance(scale * recorded, variance, bound_m)
 
     def bound_between_m(self, begin_ns: Ints | int, end_ns: Ints) -> Floats:
-        """How much the distance between instants may be off, as braking and acceleration prove it [m]."""
+        """How much the distance between instants [ns] may be off, as braking and acceleration prove it [m]."""
         begin_ns = np.broadcast_to(begin_ns, end_ns.shape)
         if self.bound is None:
             return np.zeros(end_ns.size)
         return (self.scale or 1.0) * self.bound.between_m(self.seconds(begin_ns), self.seconds(end_ns))
 
     def distance_between(self, begin_ns: Ints | int, end_ns: Ints) -> Floats:
-        """The same distance as the train itself believes it [m]; NaN where anything of it is in doubt."""
+        """Signed distance between instants [ns] as the train believes it [m]; NaN where any of it is in doubt."""
         begin_ns = np.broadcast_to(begin_ns, end_ns.shape)
-        same = self.doubt_at_s(self.seconds(begin_ns)) == self.doubt_at_s(self.seconds(end_ns))
+        same = self.cumulative_doubt_m(self.seconds(begin_ns)) == self.cumulative_doubt_m(self.seconds(end_ns))
         return self._counted_between(begin_ns, end_ns, same)
 
-    def proved_between(self, begin_ns: Ints | int, end_ns: Ints) -> Floats:
-        """The same distance [m], NaN where braking and acceleration leave any of it in doubt."""
+    def proved_distance_between(self, begin_ns: Ints | int, end_ns: Ints) -> Floats:
+        """Signed distance between instants [ns] [m]; NaN where braking and acceleration leave any of it in doubt."""
         begin_ns = np.broadcast_to(begin_ns, end_ns.shape)
         return self._counted_between(begin_ns, end_ns, self.bound_between_m(begin_ns, end_ns) == 0.0)
 
     def steps_m(self, t_ns: Ints) -> Floats:
-        """The same from each instant to the next [m], shape (n - 1,)."""
+        """`proved_distance_between` each instant [ns] and the next [m], shape (n - 1,)."""
         return self._where_sure(np.diff(self.distance_at(t_ns)), self.bound_between_m(t_ns[:-1], t_ns[1:]) == 0.0)
 
     def _counted_between(self, begin_ns: Ints, end_ns: Ints, sure: Bools) -> Floats:
@@ -214,9 +217,10 @@ class Odometry:
     def increments(
         self, t_ns: Ints, scale: Floats, latency_s: Floats, now: OdometerReading | None = None
     ) -> Increments:
-        """Both ends of a step with the scale and latency in use at the later one.
+        """Corrected distance and change of speed of the step to each instant, 0 at the first.
 
-        `now`: the reading at the later ends, if it was made already.
+        Both ends of a step are read with the scale and latency in use at the later one. `now`: the reading at the later
+        ends, if it was made already.
         """
         steps = self._steps_s(t_ns, latency_s)
         now = now or self.read(steps.end_s)
@@ -240,19 +244,19 @@ class Odometry:
         return np.zeros(t_s.size) if self.bridged_m2 is None else np.interp(t_s, self.t_s, self.bridged_m2)
 
     def read(self, t_s: Floats) -> OdometerReading:
-        """All that the odometer says of these instants."""
+        """What the odometer reads at these instants [s]: distance, speed, doubt and noise, each made when asked for."""
         return OdometerReading(self, t_s)
 
     def known_at_s(self, t_s: Floats) -> Bools:
-        """Between two samples without a pause, none of which reports slip."""
+        """Whether each instant lies between two samples without a pause, none of which reports slip."""
         return self.read(t_s).known
 
     def distance_at_s(self, t_s: Floats) -> Floats:
-        """Interpolated where it is not known, the end value outside the recording [m]."""
+        """Distance as recorded, interpolated also where it is not known, the end value outside the recording [m]."""
         return np.interp(t_s, self.t_s, self.distance_m)
 
     def speed_at_s(self, t_s: Floats) -> Floats:
-        """Mean over the second before [m/s]."""
+        """Mean speed as recorded over the second before each instant [m/s]."""
         return self.read(t_s).speed_mps
 
     def speed_about(self, t_ns: Ints) -> Floats:
@@ -274,12 +278,12 @@ class Odometry:
 
     @cached_property
     def has_pauses(self) -> bool:
-        """Anywhere between two samples nothing is interpolated."""
+        """Whether there are two samples between which nothing is interpolated."""
         return bool(self.pause.any())
 
     @cached_property
     def has_slips(self) -> bool:
-        """A sample reports slip."""
+        """Whether any sample reports slip."""
         return bool(self.slip.any())
 
     @cached_property

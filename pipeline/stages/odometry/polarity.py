@@ -38,7 +38,9 @@ def counted_over_slip(
     open_steps = odometry.slip[1:] | odometry.slip[:-1]
     for odometer in others:
         counted_m = np.diff(odometer.distance_at(t_ns))
-        counts = open_steps & np.isfinite(counted_m) & (np.diff(odometer.doubt_at_s(odometer.seconds(t_ns))) == 0.0)
+        counts = (
+            open_steps & np.isfinite(counted_m) & (np.diff(odometer.cumulative_doubt_m(odometer.seconds(t_ns))) == 0.0)
+        )
         sense = relative_sense(own_m, counted_m, orientation_m)
         step_m[counts] = sense * counted_m[counts] / (odometry.scale or 1.0)
         doubt_m[counts] = np.maximum(config.other_way_share * np.abs(step_m[counts]), LEAST_DOUBT_M)

@@ -60,13 +60,14 @@ class Regression:
     """movement = design @ (scale, scale * rest of the lag), by instrumental variables, over the `used` movements.
 
     `instruments`: the same columns from other rows of the counter, so that their noise is not that of `design`.
+    `overlap_count`: movements that overlap each one, itself included.
     """
 
     design: Floats
     instruments: Floats
     moved_m: Floats
     used: Bools
-    overlap: int
+    overlap_count: int
 
     def solved(self, assumed_s: float) -> ScaleLag:
         """Scale and lag."""
@@ -90,9 +91,11 @@ class Regression:
         # Instrumental variables: theta = (Z' X)^-1 Z' y; its covariance (Z' X)^-1 S (Z' X)^-T, S that of Z' e.
         theta = inverse @ (instruments.T @ self.moved_m)
         left = np.where(self.used, self.moved_m - design @ theta, 0.0)
-        spreads = [_spread(instruments, left, self.used, reach) for reach in (self.overlap, _MEMORY * self.overlap)]
+        spreads = [
+            _spread(instruments, left, self.used, reach) for reach in (self.overlap_count, _MEMORY * self.overlap_count)
+        ]
         variances = np.max([np.diag(inverse @ one @ inverse.T) for one in spreads], axis=0)
-        sigmas = student_factor(self.used.sum() / self.overlap - 2.0) * np.sqrt(np.maximum(variances, 0.0))
+        sigmas = student_factor(self.used.sum() / self.overlap_count - 2.0) * np.sqrt(np.maximum(variances, 0.0))
         sigmas = np.maximum(sigmas, self._without_one(design, instruments, theta))
         return [float(value) for pair in zip(theta, sigmas, strict=True) for value in pair]
 
@@ -105,7 +108,7 @@ class Regression:
         moments = instruments[:, :, None] * np.concatenate([design, self.moved_m[:, None]], axis=1)[:, None, :]
         # Sums up to each row: what any stretch contributes is the difference of two of them.
         sums = np.cumsum(np.concatenate([np.zeros((1, *moments.shape[1:])), moments]), axis=0)
-        reach = max(self.overlap + 1, min(_LEFT_OUT * self.overlap, len(design) // 4))
+        reach = max(self.overlap_count + 1, min(_LEFT_OUT * self.overlap_count, len(design) // 4))
         begin = np.arange(len(design) - reach + 1)
         end = begin + reach
         if theta.size > 1:
@@ -126,7 +129,7 @@ class Regression:
         change = self.instruments[used, 1]
         usual = float(np.sqrt(np.mean(change[change != 0.0] ** 2)))
         rows = np.flatnonzero(np.abs(change) > _CHANGES * usual)
-        other = (np.diff(rows) > self.overlap) | (np.diff(np.sign(change[rows])) != 0.0)
+        other = (np.diff(rows) > self.overlap_count) | (np.diff(np.sign(change[rows])) != 0.0)
         begin, end = used[rows[np.append(True, other)]], used[rows[np.append(other, True)]] + 1
         return begin, end
 
@@ -135,7 +138,7 @@ class Regression:
         if _alike_columns(self.instruments[self.used].T @ self.design[self.used]):
             return False
         near, instruments = self.design[self.used, 1], self.instruments[self.used, 1]
-        noise = 0.5 * float(((near - instruments) ** 2).sum()) / np.sqrt(near.size / self.overlap)
+        noise = 0.5 * float(((near - instruments) ** 2).sum()) / np.sqrt(near.size / self.overlap_count)
         return bool(near @ instruments > SHOWN * noise)
 
     def halves(self, assumed_s: float, parts: slice = slice(None)) -> tuple[tuple[float, float], ...]:

@@ -254,18 +254,18 @@ class _DistancePairs:
     @property
     def count(self) -> float:
         """Number of movements that do not overlap."""
-        return 1.0 + (self.begin_s.size - 1.0) / self.overlap
+        return 1.0 + (self.begin_s.size - 1.0) / self.overlap_count
 
     @cached_property
-    def overlap(self) -> int:
-        """A movement overlaps so many, itself and those after it."""
+    def overlap_count(self) -> int:
+        """Median number of movements that begin before one of them ends, itself included; at least 1."""
         after = np.searchsorted(self.begin_s, self.end_s - 1e-6)
         return max(1, round(median(after - np.arange(after.size))))
 
     @property
     def step(self) -> int:
-        """One of so many movements is looked at in a search: they do not overlap."""
-        return max(self.overlap, self.begin_s.size // _SEARCHED, 1)
+        """A search looks at every so many-th movement: these do not overlap."""
+        return max(self.overlap_count, self.begin_s.size // _SEARCHED, 1)
 
     def _apart_m(self, lag_s: Floats) -> tuple[Floats, Floats]:
         """How far movements that do not overlap are apart at each lag (lags, movements), at the scale that makes their
@@ -372,7 +372,7 @@ class _DistancePairs:
             theta, used = solved, kept
             if same:
                 break
-        used = used & ~widened(moving & ~used, self.overlap // 2)
+        used = used & ~widened(moving & ~used, self.overlap_count // 2)
         if used.sum() < FEWEST:
             return None
-        return Regression(design, instruments, self.moved_m, used, self.overlap)
+        return Regression(design, instruments, self.moved_m, used, self.overlap_count)

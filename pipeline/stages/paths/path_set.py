@@ -108,7 +108,9 @@ class LifeSpan(NamedTuple):
 
 @frozen
 class PathSet:
-    """All hypotheses of a run with what became of each; `groups`: lines without a branch, per net element.
+    """All path hypotheses of a run (`nodes`) and at which of the `steps` each began, ended and was refuted.
+
+    `groups`: number of the line without a branch that each net element belongs to.
 
     `overflow`: step from which on there were more hypotheses than are followed; `unclaimed`: steps after it, and those
     of the first minute of a set that began anew though no movement had led back: its errors may be larger than stated;

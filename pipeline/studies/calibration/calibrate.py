@@ -110,7 +110,7 @@ def observe_run(log: RunLog, site: Site, vehicle: Vehicle, config: Configuration
     # A run with a wrong unit or clock would teach its error to every other run.
     required_fit(prepared, solution, Vehicle(antenna_height_m=vehicle.antenna_height_m))
     match = prepared.match(solution)
-    odometry = None if prepared.odometry is None else prepared.odometry.oriented(match.odometer_sign)
+    odometry = None if prepared.odometry is None else prepared.odometry.growing_along_path(match.odometer_sign)
     estimate = None if odometry is None else _estimate_vehicle(match, odometry)
     measured = (
         vehicle if estimate is None else _calibrated_vehicle(vehicle, [estimate], config.align.latency_prior_sigma_s)

@@ -129,6 +129,8 @@ _ACCURACY_TIMES = 2.5
 
 
 class _Fact(BaseModel):
+    """An entry of `causes.toml`, with no keys but those named."""
+
     model_config = ConfigDict(frozen=True, extra="forbid")
 
 

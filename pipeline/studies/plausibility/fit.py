@@ -50,8 +50,8 @@ class Fit:
     checks: tuple[Check, ...]
 
     @property
-    def impossible(self) -> tuple[Check, ...]:
-        """What no train can have, and a known cause explains."""
+    def impossible_checks(self) -> tuple[Check, ...]:
+        """The checks whose finding no train can have driven, and a known cause explains."""
         return tuple(check for check in self.checks if check.state is FitState.IMPOSSIBLE)
 
     @property
@@ -73,7 +73,7 @@ class Fit:
     @property
     def misfits(self) -> tuple[Check, ...]:
         """What does not fit, the impossible first."""
-        return (*self.impossible, *(check for check in self.checks if check.state is FitState.MISFIT))
+        return (*self.impossible_checks, *(check for check in self.checks if check.state is FitState.MISFIT))
 
     @property
     def codes(self) -> list[MisfitCause]:
@@ -89,7 +89,7 @@ class Fit:
 
 def clock_advice(run: RunLog) -> str:
     """What makes recorders of different times one journey, in sentences; empty where nothing does."""
-    impossible = fit_run(run, run.solutions()[0], Vehicle(), PlausibilityConfig()).impossible
+    impossible = fit_run(run, run.solutions()[0], Vehicle(), PlausibilityConfig()).impossible_checks
     return " ".join([*(f"{check.sentence}." for check in impossible), remedy_of(impossible)]).rstrip(" ")
 
 
@@ -148,7 +148,7 @@ def required_fit(prepared: PreparedRun, solution: str, vehicle: Vehicle) -> Fit:
     if prepared.odometry is not None:
         sensor = config.lds.odometer_sensor
         fit = with_checks(fit, [follows_check(sensor, prepared.follows_of(solution), config.evidence)])
-    impossible = fit.impossible
+    impossible = fit.impossible_checks
     if not impossible or config.ingest.plausibility == "warn":
         return fit
     raise InputError(
@@ -258,7 +258,7 @@ def fit_report(
     if text:
         tables["Lines that mend it"] = pl.DataFrame({"toml": text.splitlines()})
     failing = fits.values() if config.ingest.plausibility == "fail" and not problems else ()
-    impossible = dict.fromkeys(check.sentence for fit in failing for check in fit.impossible)
+    impossible = dict.fromkeys(check.sentence for fit in failing for check in fit.impossible_checks)
     return FitReport(tables, problems + tuple(impossible), mending)
 
 

@@ -38,14 +38,15 @@ class Regression:
     whole: bool
 
 
-def halves_of(count: int) -> tuple[slice, slice]:
+def split_in_half(count: int) -> tuple[slice, slice]:
     """The first and the second half of so many rows."""
     return slice(None, count // 2), slice(count // 2, None)
 
 
-def steady(whole: Floats, *halves: Floats) -> bool:
-    """Whether every half points in the same direction as the whole, and by more than half of it: a drift in one
-    does not.
+def halves_agree(whole: Floats, *halves: Floats) -> bool:
+    """Whether each half shows more than half of what the whole run does, in the same direction.
+
+    Vectors of one shape, such as a shift north and east. A drift in one half alone is not shown by the other.
     """
     return all(float(half @ whole) > 0.5 * float(whole @ whole) for half in halves)
 
@@ -62,7 +63,7 @@ def regressed(design: Floats, target: Floats, floor: float, least_known: float =
     for least_absolute in (True, False):
         for _ in range(_ROUNDS):
             before = estimate
-            spread = max(1.4826 * usual(left), floor)
+            spread = max(1.4826 * quantile_of_known(left), floor)
             if least_absolute:
                 weight = floor / np.maximum(left, floor)
             else:
@@ -71,7 +72,7 @@ def regressed(design: Floats, target: Floats, floor: float, least_known: float =
             left = _lengths(target - design @ estimate)
             if np.abs(estimate - before).max() <= _STAYS:
                 break
-    alone = (_solved(design[part], target[part], weight[part], least_known)[0] for part in halves_of(len(target)))
+    alone = (_solved(design[part], target[part], weight[part], least_known)[0] for part in split_in_half(len(target)))
     halves = tuple(alone) if len(target) >= 2 * LEAST else ()
     whole = bool(np.isfinite(variance).all())
     return Regression(estimate, spread * np.sqrt(variance), weight, spread, halves, whole)
@@ -95,7 +96,10 @@ def _solved(design: Floats, target: Floats, weight: Floats, least_known: float) 
 
 
 def explains(share: float, before: float) -> bool:
-    """Whether a cause explains a misfit: most of the run agrees with it, and it leaves half of the rest at most."""
+    """Whether a cause explains a misfit: most of the run agrees with it, and it leaves half of the rest at most.
+
+    `share`: of the run that agrees with the cause, `before`: without it, both 0 to 1.
+    """
     return share >= 0.5 and 1.0 - share <= 0.5 * (1.0 - before)
 
 
@@ -107,8 +111,11 @@ def sampled(rows: Bools, most: int = 800) -> Bools:
     return kept
 
 
-def usual(values: Floats, share: float = 0.5) -> float:
-    """Quantile of what is known; NaN where nothing is."""
+def quantile_of_known(values: Floats, share: float = 0.5) -> float:
+    """Quantile of the finite values, by default their median; NaN where there are none.
+
+    `share`: of the values that lie below it, 0 to 1.
+    """
     known = values[np.isfinite(values)]
     if not known.size:
         return float("nan")
@@ -207,21 +214,24 @@ class PairFit:
 
 
 def _beyond(apart: Floats, least: float) -> bool:
-    """Whole run first, then its halves."""
-    return abs(apart[0]) > least and steady(*apart[:, None])
+    """Whether a share of the whole run (first) and of its halves (then) is larger than `least`, and lasts."""
+    return abs(apart[0]) > least and halves_agree(*apart[:, None])
 
 
 def fit_pair(gnss: Places, counter: Record) -> PairFit:
     """Scale and lag of a counter against positions; first the clocks, then both at once."""
     coarse_s, clock_reason = clock_lag(gnss, counter)
-    fit = _fitted(gnss, counter, coarse_s)
+    fit = _fit_by_windows(gnss, counter, coarse_s)
     if coarse_s and abs(fit.lag_s - coarse_s) > _SPEED_LAG_S:
         fit = replace(fit, lag_s=coarse_s, lag_sigma_s=_SPEED_LAG_S / 2.0)
     return replace(fit, shifted=coarse_s != 0.0, clock_reason="" if fit.lag_known else clock_reason)
 
 
-def _fitted(gnss: Places, counter: Record, lag_s: float) -> PairFit:
-    """Scale and lag by windows, once the clocks agree to within half a minute."""
+def _fit_by_windows(gnss: Places, counter: Record, lag_s: float) -> PairFit:
+    """Scale and lag by distances over windows, once the clocks agree to within half a minute.
+
+    `lag_s`: of the clocks, as `clock_lag` found it [s].
+    """
     begin_s, end_s = _common(gnss, counter, lag_s)
     if end_s - begin_s < 3.0 * _WINDOW_LEAST_S:
         return PairFit(reason="nothing in common")
@@ -230,7 +240,7 @@ def _fitted(gnss: Places, counter: Record, lag_s: float) -> PairFit:
     counted = counter.gained(starts + lag_s - found.lag_s, ends + lag_s - found.lag_s)
     known = np.isfinite(counted)
     # Neither a counter that stands most of the time nor one that is reset shows what is usual.
-    counts = np.abs(counted) > _SLOW_SHARE * usual(np.abs(counted), 0.8)
+    counts = np.abs(counted) > _SLOW_SHARE * quantile_of_known(np.abs(counted), 0.8)
     share = float(counts[known].mean()) if known.any() else 1.0
     stands = share < 0.1
     if counts.sum() < LEAST or not np.isfinite(found.scale_sigma):
@@ -266,7 +276,7 @@ def _windows(gnss: Places, begin_s: float, end_s: float) -> tuple[Floats, Floats
     step_s = max(length_s / _WINDOWS_OVERLAP, (end_s - begin_s) / _WINDOWS_MOST)
     starts = gnss.instants(step_s, begin_s, end_s - length_s)
     distance_m = gnss.distance_m(starts, starts + length_s)
-    moves = np.nan_to_num(distance_m) > max(_SLOW_SHARE * usual(distance_m, 0.9), MOVING_MPS * length_s)
+    moves = np.nan_to_num(distance_m) > max(_SLOW_SHARE * quantile_of_known(distance_m, 0.9), MOVING_MPS * length_s)
     return starts[moves], starts[moves] + length_s, distance_m[moves]
 
 
@@ -308,7 +318,7 @@ def _possible_lags(gnss: Places, other: Record) -> tuple[list[float], str]:
             return [], "the rows are too far apart"
         speed = np.abs(record.speed(np.arange(part[0], part[-1] + 0.5, 1.0)))
         # Without speeds that only a jump of the position has.
-        speed[speed > 1.5 * usual(speed, 0.95) + 1e-9] = np.nan
+        speed[speed > 1.5 * quantile_of_known(speed, 0.95) + 1e-9] = np.nan
         if np.isfinite(speed).sum() < _COMMON_S:
             return [], f"less than {_COMMON_S:.0f} s of movement are known"
         if np.nanstd(speed) < _SPEED_CHANGE * max(float(np.nanmean(speed)), 1e-9):
@@ -358,11 +368,11 @@ def _agreement(gnss: Places, other: Record, lag_s: float, least_overlap: float) 
     grid = np.linspace(begin_s, end_s, int(np.clip(end_s - begin_s, 20, 800)))
     speeds = np.stack([gnss.speed(grid), np.abs(other.speed(grid + lag_s))])
     of_gnss, of_other = speeds[:, np.isfinite(speeds).all(axis=0)]
-    moves = [speed > _SLOW_SHARE * usual(speed, 0.9) for speed in (of_gnss, of_other)]
+    moves = [speed > _SLOW_SHARE * quantile_of_known(speed, 0.9) for speed in (of_gnss, of_other)]
     both = moves[0] & moves[1]
     if both.sum() < LEAST:
         return 0.0
     factor = float(np.median(of_other[both] / of_gnss[both]))
-    bound = _ALIKE_SHARE * of_gnss + _ALIKE_USUAL * usual(of_gnss, 0.9)
+    bound = _ALIKE_SHARE * of_gnss + _ALIKE_USUAL * quantile_of_known(of_gnss, 0.9)
     alike = np.abs(of_other / factor - of_gnss) < bound
     return float(np.mean(alike[moves[0] | moves[1]])) * float(end_s - begin_s) / float(shorter_s)

@@ -16,7 +16,14 @@ from pipeline.stages.track.network import surveyed_track
 from pipeline.studies.plausibility.check import KNOWN, Cause, Check, FitState, correction, fits, misfit, not_checked
 from pipeline.studies.plausibility.clocks import StreamLag
 from pipeline.studies.plausibility.odometer import odometer_checks, velocity_checks
-from pipeline.studies.plausibility.pairs import LEAST, SIGNIFICANT_SIGMAS, explains, halves_of, steady, usual
+from pipeline.studies.plausibility.pairs import (
+    LEAST,
+    SIGNIFICANT_SIGMAS,
+    explains,
+    halves_agree,
+    quantile_of_known,
+    split_in_half,
+)
 from pipeline.studies.plausibility.recording import Recording
 from pipeline.studies.plausibility.shifts import SurveyLine, common_lag, fit_places, fit_survey, in_words, passing_lags
 from schemas.arrays import NS_PER_S, Floats, Ints, floats, times_ns
@@ -269,11 +276,13 @@ def survey_checks(of: Recording, line: SurveyLine) -> list[Check]:
 def _height_checks(base: str, up_m: Floats, of: Recording) -> list[Check]:
     """Heights of the survey or reference, which lie `up_m` above those of the positions."""
     what = f"heights against the {base}"
-    apart_m = usual(up_m)
+    apart_m = quantile_of_known(up_m)
     if not np.isfinite(apart_m):
         return []
     words = f"the {base} lies {apart_m:.0f} m above them"
-    is_steady = steady(*(np.array([usual(up_m[part])]) for part in (slice(None), *halves_of(len(up_m)))))
+    is_steady = halves_agree(
+        *(np.array([quantile_of_known(up_m[part])]) for part in (slice(None), *split_in_half(len(up_m))))
+    )
     if abs(apart_m) <= 1.5 * of.config.reported_shift_m or not is_steady:
         return [fits(what, words)]
     # No lines: survey or reference alone cannot show that it is right, and the other may be.

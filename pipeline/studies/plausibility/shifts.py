@@ -9,7 +9,15 @@ import numpy as np
 from pipeline.stages.track.geodesy import Points
 from pipeline.stages.track.network import Once, surveyed_track
 from pipeline.stages.track.segments import Polyline, project_on_segments
-from pipeline.studies.plausibility.pairs import LEAST, clock_lag, explains, halves_of, regressed, sampled, steady
+from pipeline.studies.plausibility.pairs import (
+    LEAST,
+    clock_lag,
+    explains,
+    halves_agree,
+    regressed,
+    sampled,
+    split_in_half,
+)
 from pipeline.studies.plausibility.records import MOVING_MPS, Places
 from schemas.arrays import Floats, Ints
 from schemas.config import PlausibilityConfig
@@ -101,8 +109,8 @@ def _refined(gnss: Places, record: Places, lag_s: float, config: PlausibilityCon
         lag_sigma_s=3.0 * float(fit.sigma[0]) if fit.whole else fit.spread / float(np.linalg.norm(velocity)),
         agreeing=float(np.mean(np.linalg.norm(apart - design @ fit.estimate, axis=1) < bound)),
         as_recorded=float(np.mean(np.linalg.norm(apart, axis=1) < bound)),
-        lag_is_steady=steady(*(part[:1] - lag_s for part in of_parts)),
-        shift_is_steady=steady(*(part[1:] for part in of_parts)),
+        lag_is_steady=halves_agree(*(part[:1] - lag_s for part in of_parts)),
+        shift_is_steady=halves_agree(*(part[1:] for part in of_parts)),
     )
 
 
@@ -203,7 +211,9 @@ def fit_survey(gnss: Places, line: SurveyLine, near_m: float) -> SurveyFit:
         across, apart, height_m = across_track(nearest)
     explained = across @ shift
     left = np.abs(apart - explained)
-    is_steady = all(explained[half] @ apart[half] > 0.5 * (explained[half] ** 2).sum() for half in halves_of(len(left)))
+    is_steady = all(
+        explained[half] @ apart[half] > 0.5 * (explained[half] ** 2).sum() for half in split_in_half(len(left))
+    )
     # By metres, not by what is left elsewhere: a shift brings no run onto a network that it left.
     near = float(np.mean(left < near_m)) > _SHIFT_POSITIONS
     constant = float(np.median(left)) < _SHIFT_LEAVES * aside_m and near and is_steady

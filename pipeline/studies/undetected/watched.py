@@ -172,9 +172,9 @@ def _thresholds(bank: AxisBank, epoch: Ints, fastest_mps: float) -> Floats:
 def _least_share_observed(epochs: pl.DataFrame, epoch: Ints, most: float) -> float:
     """How much of a fault the increments show, at least; one on straight track.
 
-    `along_m` leaves out what a curve adds to the movement of a position y off the track (`alignment.align.unrolled`). A
-    fault carries the position to where the track lies otherwise, and so hides y times the turn in between: at most y
-    times the sharpest curvature times the fault.
+    `along_m` leaves out what a curve adds to the movement of a position y off the track
+    (`alignment.align.curve_corrected_path_m`). A fault carries the position to where the track lies otherwise, and so
+    hides y times the turn in between: at most y times the sharpest curvature times the fault.
     """
     curvature, offset = (np.abs(np.nan_to_num(floats(epochs, name)[epoch])) for name in _CURVE_COLUMNS)
     return 1.0 - min(float(curvature.max(initial=0.0) * offset.max(initial=0.0)), most)

@@ -57,10 +57,10 @@ def written(folder: Path, name: str, *features: dict[str, Any]) -> Path:
 
 def site_of(*surveys: Path, balises: str | None = None, **wishes: Any) -> Site:
     travel = wishes.get("travel", TravelAlong.BOTH)
-    wish = site_request(
+    request = site_request(
         list(surveys), balises, wishes.get("epsg"), wishes.get("join_m"), wishes.get("flat", False), travel
     )
-    return make_site(wish, Vehicle(), Configuration(survey=SurveyConfig(**wishes.get("config", {}))))
+    return make_site(request, Vehicle(), Configuration(survey=SurveyConfig(**wishes.get("config", {}))))
 
 
 def navigable(site: Site) -> set[frozenset[tuple[str, int]]]:

@@ -133,5 +133,7 @@ def align_with(epochs, found, vehicle, config):
     if found is not None:
         placed = epochs["fix_valid"].to_numpy() & epochs["on_track"].to_numpy()
         path_m = np.where(placed, floats(epochs, "path_m"), np.nan)
-        found = found.oriented(polarity(found, times_ns(epochs), path_m, config.matching.orientation_distance_m))
+        found = found.growing_along_path(
+            polarity(found, times_ns(epochs), path_m, config.matching.orientation_distance_m)
+        )
     return align(arrays_of_table(MatchedEpochs, epochs), found, vehicle, config).table

@@ -179,7 +179,7 @@ def test_the_odometer_is_known_at_times_between_epochs_and_inside_gaps():
     at_ns = np.round(np.array([0.5, 90.05, 110.0, 150.0, 300.0]) * 1e9).astype(np.int64)
     start = distance(np.array([1.0, 200.0]))[0]
     expected = distance(np.array([0.5, 90.05, 110.0, 150.0, 200.0]))[:4] - start
-    odometry = odometry_from(odometer, vehicle, CONFIG).oriented(-1)
+    odometry = odometry_from(odometer, vehicle, CONFIG).growing_along_path(-1)
     found = odometer_at(at_ns, arrays_of_table(AlignedEpochs, aligned), odometry)
     assert np.isnan(found[4])
     np.testing.assert_allclose(found[:4], expected, atol=2.5)

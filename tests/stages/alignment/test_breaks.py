@@ -199,7 +199,7 @@ def filter_at_rest():
     path_m = odometry.distance_at_s(at_s)
     state = learner.start(prior_of(Vehicle(), CONFIG.align), 20.0, float(path_m[0]))
     joints = learner.run(state, at_s, path_m, np.ones(at_s.size), np.zeros(at_s.size))
-    return learner, learner.after(state, joints[-1], float(at_s[-1])), odometry
+    return learner, learner.state_after(state, joints[-1], float(at_s[-1])), odometry
 
 
 def resumed(gap_s, beside_m, jitter_s=0.0):
@@ -275,7 +275,7 @@ def test_a_position_from_far_away_leaves_a_covariance():
 
 def test_a_position_has_settled_after_some_minutes():
     learner, before, after = resumed(90.0, 12.0)
-    after_minutes = [learner.after(after, after.joint, after.t_s + 60.0 * k).unsettled_m2 for k in range(5)]
+    after_minutes = [learner.state_after(after, after.joint, after.t_s + 60.0 * k).unsettled_m2 for k in range(5)]
     assert before.unsettled_m2 == 0.0
     assert after_minutes == sorted(after_minutes, reverse=True)
     assert after_minutes[0] == after.unsettled_m2

@@ -35,7 +35,7 @@ def odometer(scale: float | None) -> Any:
     def driven_m(begin_ns: Ints, end_ns: Ints) -> Any:
         return 10.2 * np.abs(end_ns - begin_ns) / NS_PER_S
 
-    return SimpleNamespace(has_known_scale=scale is not None, between=between, driven_between_m=driven_m)
+    return SimpleNamespace(has_known_scale=scale is not None, distance_and_variance=between, driven_between_m=driven_m)
 
 
 def test_a_gap_has_the_anchors_that_there_are() -> None:

@@ -117,7 +117,7 @@ def test_it_contradicts_a_reference() -> None:
     drift = np.clip((np.arange(4000) / 10.0 - 150.0), 0.0, 60.0)
     of_reference = reference(ride, rng, ahead_m=drift)
     found = known(GROUND, of_origin(odometer(ride, rng), Origin.UNKNOWN), of_reference=of_reference)
-    assert found.doubted > 0
+    assert found.contradiction_count > 0
 
 
 @pytest.mark.parametrize(("late_s", "least_s"), [(0.0, 0.2), (0.6, 0.75)])
@@ -142,7 +142,7 @@ def test_an_odometer_of_unknown_origin_that_parts_from_a_wheel_disputes(scale: f
     wheel = of_origin(odometer(ride, rng), Origin.WHEEL)
     other = of_origin(odometer(ride, rng), Origin.UNKNOWN).with_columns(pl.col("distance_m") * scale)
     found = known(GROUND, wheel, other, of_reads=reads(ride, GROUND, rng))
-    assert found.parted is parted
+    assert found.odometers_disagree is parted
     # It narrows nothing, and widens nothing.
     at_s = np.arange(20.0, 380.0, 7.0)
     alone = known(GROUND, wheel, of_reads=reads(ride, GROUND, np.random.default_rng(7)))

@@ -150,7 +150,7 @@ def test_a_reference_that_steps_ahead_and_back_leaves_both_sides_all_along() -> 
     at_s = np.arange(5.05, 390.0, 0.5)
     low, high, holds = bounds(found.at(ns(at_s)), ride.at(at_s))
     assert holds.all()
-    assert found.doubted == 2
+    assert found.contradiction_count == 2
     assert (high - low).min() > 25.0
     assert (high - low).max() < 27.0
 
@@ -164,7 +164,7 @@ def test_a_spike_of_the_reference_is_doubted_for_as_long_as_it_lasts() -> None:
     low, high, holds = bounds(found.at(ns(at_s)), ride.at(at_s))
     spike = (at_s > 100.0) & (at_s < 104.0)
     assert holds.all()
-    assert found.doubted == 0
+    assert found.contradiction_count == 0
     assert (high - low)[spike].min() > 25.0
     assert (high - low)[~spike].max() < 2.0
 
@@ -177,7 +177,7 @@ def test_a_reference_that_drifts_beside_an_odometer_says_nothing(rate_mps: float
     drift = np.clip((np.arange(4000) / 10.0 - 150.0) * rate_mps, 0.0, 20.0)
     vehicle = FILES[file]
     found = known(GROUND, odometer(ride, rng), of_reference=reference(ride, rng, ahead_m=drift), vehicle=vehicle)
-    assert found.doubted > 0
+    assert found.contradiction_count > 0
     assert found.at(ns(np.arange(200.0, 390.0, 1.0))).kind.tolist() == [NOTHING] * 190
 
 
@@ -192,7 +192,7 @@ def test_a_drift_may_have_begun_where_no_odometer_counted() -> None:
     drift_m = np.clip(np.arange(4000) / 10.0 - 150.0, 0.0, 40.0)
     truth = reads(ride, GROUND, rng).head(3)
     found = known(GROUND, counted, of_reference=reference(ride, rng, ahead_m=drift_m), of_reads=truth)
-    assert found.doubted
+    assert found.contradiction_count
     at_s = np.arange(5.0, 390.0, 0.7)
     evidence = found.at(ns(at_s))
     _, _, holds = bounds(evidence, ride.at(at_s))
@@ -222,7 +222,7 @@ def test_a_leap_that_no_train_can_drive_doubts_the_reference(lasts_s: float, cou
     odometers = [] if counted == "is not there" else [_hung(odometer(ride, rng), 150.0, ends_s)]
     found = known(GROUND, *odometers, of_reference=hung, of_reads=reads(ride, GROUND, rng), vehicle=Vehicle())
     # An odometer that bridges the hang has it end where it began, as a spike, which is open while it lasts.
-    assert found.doubted or counted == "hangs too"
+    assert found.contradiction_count or counted == "hangs too"
     at_s = np.arange(5.0, 390.0, 0.3)
     evidence = found.at(ns(at_s))
     _, _, holds = bounds(evidence, ride.at(at_s))
@@ -235,7 +235,7 @@ def test_a_train_that_brakes_hard_leaps_nowhere() -> None:
     rng = np.random.default_rng(17)
     ride = Ride((0.0, 30.0, 60.0, 91.0, 101.0, 132.0, 160.0), (0.0, 48.0, 50.0, 0.0, 0.0, 50.0, 50.0))
     for rate_hz in (1.0, 10.0):
-        assert known(GROUND, of_reference=reference(ride, rng, rate_hz=rate_hz)).doubted == 0
+        assert known(GROUND, of_reference=reference(ride, rng, rate_hz=rate_hz)).contradiction_count == 0
 
 
 def test_a_reference_that_stepped_in_a_gap_is_doubted_on_both_sides() -> None:
@@ -248,7 +248,7 @@ def test_a_reference_that_stepped_in_a_gap_is_doubted_on_both_sides() -> None:
     found = known(GROUND, odometer(ride, rng), of_reference=whole.filter(~gap))
     at_s = np.concatenate([np.arange(5.0, 190.0, 1.0), np.arange(205.0, 390.0, 1.0)])
     low, high, holds = bounds(found.at(ns(at_s)), ride.at(at_s))
-    assert found.doubted == 1
+    assert found.contradiction_count == 1
     assert holds.all()
     assert (high - low).min() > 28.0
 
@@ -300,7 +300,7 @@ def test_an_odometer_that_stands_contradicts_the_reference_which_says_nothing_th
     lost = np.cumsum(missing * np.diff(ride.x_m, prepend=ride.x_m[:1]))
     found = known(GROUND, odometer(ride, rng, lost), of_reference=reference(ride, rng))
     at_ns = ns(np.arange(5.05, 390.0, 0.5))
-    assert found.doubted > 0
+    assert found.contradiction_count > 0
     assert (found.at(at_ns).kind == NOTHING).all()
 
 

@@ -211,8 +211,8 @@ def test_an_axis_goes_on_from_where_it_stopped(first):
         lasting_mps=np.column_stack([dice.uniform(0.1, 1.0, count), dice.normal(size=count)]),
     )
     value, sigma, _ = run_axis(series, ALPHAS)
-    *before, state = run_axis(series.between(0, first), ALPHAS)
-    *after, _ = run_axis(series.between(first, count), ALPHAS, state)
+    *before, state = run_axis(series.rows_between(0, first), ALPHAS)
+    *after, _ = run_axis(series.rows_between(first, count), ALPHAS, state)
     for whole, parts in zip((value, sigma), zip(before, after, strict=True), strict=True):
         np.testing.assert_allclose(np.concatenate(parts), whole, rtol=1e-9)
 
@@ -235,6 +235,6 @@ def test_where_a_block_ends_leaves_the_sigmas_as_they_are():
     alphas, noise_m2 = np.array([0.3]), np.tile(np.where(np.arange(count) < 6, 4.0, 0.04)[:, None], (1, 2))
     whole = run_axis(series, alphas, None, noise_m2)[1]
     for cut in range(1, count):
-        _, before, state = run_axis(series.between(0, cut), alphas, None, noise_m2[:cut])
-        _, after, _ = run_axis(series.between(cut, count), alphas, state, noise_m2[cut:])
+        _, before, state = run_axis(series.rows_between(0, cut), alphas, None, noise_m2[:cut])
+        _, after, _ = run_axis(series.rows_between(cut, count), alphas, state, noise_m2[cut:])
         np.testing.assert_allclose(np.concatenate([before, after]), whole, rtol=1e-12)

@@ -62,7 +62,7 @@ def test_short_stalls_at_low_speed_add_up_within_the_bound(rate_hz) -> None:
         missing += np.clip(true, begin_m, end_m) - begin_m
     odometry = odometry_from(odometer_of(t, distance_m=true - missing))
     at_ns = odometry.epoch_ns + np.array([20, 350]) * NS_PER_S
-    way = odometry.between(at_ns[:1], at_ns[1:])
+    way = odometry.distance_and_variance(at_ns[:1], at_ns[1:])
     assert odometry.leaps_ns == ()
     assert missing[-1] == pytest.approx(42.0, abs=1.0)
     assert missing[-1] <= way.bound_m[0] < missing[-1] + 10 * 4.0
@@ -73,7 +73,7 @@ def test_a_stall_that_loses_its_way_is_no_bridged_reset() -> None:
     t = np.arange(0.0, 120.0, 0.1)
     missing = 28.0 * np.clip(t - 60.0, 0.0, 1.3)
     odometry = odometry_from(odometer_of(t, distance_m=28.0 * t - missing))
-    assert is_lost(np.diff(odometry.doubt_at_s(np.array([59.0, 63.0])))).all()
+    assert is_lost(np.diff(odometry.cumulative_doubt_m(np.array([59.0, 63.0])))).all()
 
 
 @pytest.mark.parametrize("rate_hz", RATES_HZ)
@@ -88,6 +88,6 @@ def test_what_is_bridged_or_interpolated_is_off_by_no_more_than_its_bound(rate_h
         reads = true + sum(rng.uniform(-400.0, 400.0) * (np.arange(t.size) >= row) for row in sets)
         odometry = odometry_from(odometer_of(t, distance_m=reads))
         step_m = np.diff(odometry.distance_at_s(t))
-        off_m = np.abs(step_m - np.diff(true))[np.diff(odometry.doubt_at_s(t)) == 0.0]
+        off_m = np.abs(step_m - np.diff(true))[np.diff(odometry.cumulative_doubt_m(t)) == 0.0]
         assert off_m.max() <= 5.0
         assert np.abs(np.diff(reads) - np.diff(true)).max() > 30.0

@@ -197,7 +197,7 @@ def test_a_reset_at_the_end_or_between_rows_far_apart_loses_the_way():
     at_the_end = odometry_from(odometer_of(0.5 * np.arange(4.0), distance_m=[1000.0, 1005.0, 1010.0, 0.0]))
     far_apart = odometry_from(odometer_of(2.0 * np.arange(5.0), distance_m=[1000.0, 1020.0, 1040.0, 0.0, 20.0]))
     assert at_the_end.doubt_m.tolist() == [0.0, 0.0, 0.0, LOST_M]
-    assert far_apart.doubt_at_s(2.0 * np.arange(5.0)).tolist() == [0.0, 0.0, 0.0, LOST_M, LOST_M]
+    assert far_apart.cumulative_doubt_m(2.0 * np.arange(5.0)).tolist() == [0.0, 0.0, 0.0, LOST_M, LOST_M]
 
 
 @pytest.mark.parametrize(("reset_m", "step_s"), [(138.0, 1.0), (39.0, 1.0), (30.0, 0.1), (9.0, 0.1)])
@@ -359,7 +359,7 @@ def test_nothing_is_filled_in_where_the_way_is_lost():
     odometry = odometry_from(frame)
     assert odometry.known_at_s(np.array([1.0, 3.0, 5.0, 16.0, 27.0])).tolist() == [True, False, False, False, True]
     # Slip by a tenth of 20 m twice; a pause of 20 s by 1.8 / 4 x 400 m.
-    assert odometry.doubt_at_s(np.array([1.0, 27.0])) == pytest.approx([0.0, 4.0 + 180.0])
+    assert odometry.cumulative_doubt_m(np.array([1.0, 27.0])) == pytest.approx([0.0, 4.0 + 180.0])
 
 
 def test_the_variance_between_two_instants_has_the_noise_of_both_rows():
@@ -368,7 +368,7 @@ def test_the_variance_between_two_instants_has_the_noise_of_both_rows():
     still = odometry_from(odometer_of(t_s, distance_m=np.maximum(20.0 * (t_s - 20.0), 0.0)))
     noisy = replace(still, noise=Noise(still.noise.white_m2_per_s, QuantisationNoise(0.25, 0.0)))
     begin, end = (still.epoch_ns + np.array([round(at * 1e9) for at in pair]) for pair in ((2.0, 22.0), (18.0, 32.0)))
-    standing, driving = noisy.between(begin, end).variance_m2
+    standing, driving = noisy.distance_and_variance(begin, end).variance_m2
     assert standing == pytest.approx(2.0 * 0.25, abs=1e-9)
     assert driving == pytest.approx(2.0 * 0.25 + 10.0 * 0.05**2, abs=1e-6)
 

@@ -56,7 +56,7 @@ def test_reversed_the_same_way_is_driven_the_other_way(phases):
     t, way = motion(phases)
     plain = odometry_from(odometer_of(t, distance_m=way))
     backwards = odometry_from(odometer_of(t, distance_m=-way))
-    turned, expected, found = (answers(one, probes(t)) for one in (plain.oriented(-1), plain, backwards))
+    turned, expected, found = (answers(one, probes(t)) for one in (plain.growing_along_path(-1), plain, backwards))
     for name, values in expected.items():
         sign = -1 if name == "distance_at" else 1
         for other in (turned, found):
@@ -73,12 +73,12 @@ def test_a_slip_is_in_doubt_and_nothing_else_changes(phases, share):
     at = probes(t)
     lost = (at > at_ns(t[slips] - PERIOD_S)) & (at < at_ns(t[slips] + PERIOD_S))
     assert (split.known_at(at) == (plain.known_at(at) & ~lost)).all()
-    in_doubt = split.doubt_at_s(split.seconds(at)) > 0.0
+    in_doubt = split.cumulative_doubt_m(split.seconds(at)) > 0.0
     assert (in_doubt[~lost] == (at[~lost] >= at_ns(t[slips]))).all()
     np.testing.assert_array_equal(split.distance_at(at)[~lost], plain.distance_at(at)[~lost])
-    across = split.between(at[:1] + 6 * NS, at[-1:] - 6 * NS)
+    across = split.distance_and_variance(at[:1] + 6 * NS, at[-1:] - 6 * NS)
     assert (across.bound_m > 0.0).all()
-    assert (plain.between(at[:1] + 6 * NS, at[-1:] - 6 * NS).bound_m == 0.0).all()
+    assert (plain.distance_and_variance(at[:1] + 6 * NS, at[-1:] - 6 * NS).bound_m == 0.0).all()
 
 
 @settings(deadline=None, max_examples=16)
@@ -93,7 +93,7 @@ def test_ways_add_up_and_are_no_shorter_than_the_distance(phases):
     assert (np.diff(moving_s) <= np.diff(t) + 1e-9).all()
     assert (travelled >= np.abs(odometry.distance_at(at) - odometry.distance_at(at[:1])) - 1e-6).all()
     first, second, both = (
-        odometry.between(at[begin : begin + 1], at[end : end + 1]).distance_m
+        odometry.distance_and_variance(at[begin : begin + 1], at[end : end + 1]).distance_m
         for begin, end in ((0, 100), (100, 200), (0, 200))
     )
     np.testing.assert_allclose(first + second, both, atol=1e-9)
@@ -129,7 +129,7 @@ def test_the_variance_of_a_way_is_what_it_scatters_by(moving, counter_m):
         )
         rows = 7.3 + rng.uniform() + np.cumsum(steps)
         read = np.floor(rows / counter_m) * counter_m if counter_m else rows
-        found = odometry_from(odometer_of(t, distance_m=read), vehicle).between(begin, end)
+        found = odometry_from(odometer_of(t, distance_m=read), vehicle).distance_and_variance(begin, end)
         true = np.interp(115.0, t, np.cumsum(speed * 0.1)) - np.interp(5.03, t, np.cumsum(speed * 0.1))
         standardised.append((found.distance_m[0] - true) / np.sqrt(max(found.variance_m2[0], 1e-18)))
     if moving:

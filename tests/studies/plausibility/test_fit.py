@@ -46,13 +46,13 @@ def test_what_is_wrong_is_reported_and_its_lines_mend_it(wrong: Wrong, trips: li
         return
     changed = wrong.change(drawn.run)
     found = fit_run(changed, "primary", Vehicle(), PlausibilityConfig(), drawn.site)
-    lines = lines_of(found.impossible).get(CONFIGURATION)
+    lines = lines_of(found.impossible_checks).get(CONFIGURATION)
     if lines is None:
         return
     config = settings_from({**tomllib.loads(lines)["ingest"]}, IngestConfig, "the lines")
     mended = fit_of(correct_run(changed, config.correct), drawn.site)
     assert not isinstance(mended, str)
-    assert mended.impossible == ()
+    assert mended.impossible_checks == ()
 
 
 def test_nothing_is_reported_of_healthy_trips(trips: list[Trip]) -> None:
@@ -67,7 +67,7 @@ def test_a_faulty_run_does_not_fail(seed: int) -> None:
     drawn = trip(seed)
     found = fit_of(drawn.run, drawn.site)
     assert not isinstance(found, str)
-    assert [check.sentence for check in found.impossible] == []
+    assert [check.sentence for check in found.impossible_checks] == []
 
 
 def test_a_run_at_constant_speed_tells_no_clock() -> None:
@@ -216,9 +216,9 @@ def test_what_is_reported_is_configuration(trips: list[Trip]) -> None:
     wide = PlausibilityConfig(reported_shift_m=60.0, lag_limit_s=12.0)
     assert [check.what for check in _fit(run, moved).misfits] == ["positions against the survey"]
     assert fit_run(run, "primary", Vehicle(), wide, moved).misfits == ()
-    (clock,) = _fit(late, trips[0].site).impossible
+    (clock,) = _fit(late, trips[0].site).impossible_checks
     assert clock.what == "clock of the odometer against the GNSS"
-    assert fit_run(late, "primary", Vehicle(), wide, trips[0].site).impossible == ()
+    assert fit_run(late, "primary", Vehicle(), wide, trips[0].site).impossible_checks == ()
 
 
 def test_a_unit_is_mended_once(trips: list[Trip]) -> None:
@@ -226,7 +226,7 @@ def test_a_unit_is_mended_once(trips: list[Trip]) -> None:
     found = _fit(scaled("odometer", distance_m=0.001)(trips[0].run), trips[0].site, vehicle)
     assert list(lines_of(found.misfits)) == [CONFIGURATION], "no second line for the vehicle file"
     percent = vehicle.model_copy(update={"odometer_scale": 100.0})
-    (check,) = _fit(trips[0].run, trips[0].site, percent).impossible
+    (check,) = _fit(trips[0].run, trips[0].site, percent).impossible_checks
     assert check.into == "write instead in the vehicle file"
 
 
@@ -237,7 +237,7 @@ def test_a_counter_that_is_reset_is_no_wrong_sign(trips: list[Trip]) -> None:
     reset = pl.col("distance_m") - pl.when(pl.int_range(pl.len()) >= middle).then(40_000.0).otherwise(0.0)
     for sign in (1.0, -1.0):
         turned = run.odometer.with_columns(distance_m=reset * sign, speed_mps=pl.col("speed_mps") * sign)
-        assert _fit(run.with_streams(odometer=turned)).impossible == ()
+        assert _fit(run.with_streams(odometer=turned)).impossible_checks == ()
 
 
 def test_recorders_of_different_hours_are_reported_with_lines(trips: list[Trip]) -> None:
