@@ -126,7 +126,7 @@ def _leads_back(history: ErrorHistory, jump: Jump) -> bool:
     """Whether a jump goes against the error before it and leaves an error within the failure limit."""
     judged = history.judged
     back = float(judged.middle_m[jump.first - 1]) * jump.step_m < 0.0
-    within = float(judged.least_m[jump.last]) <= history.config.hazards.limits.failure_m
+    within = float(judged.least_m[jump.last]) <= float(judged.limit_m[jump.last])
     return back and within and judged.code[jump.last] != WRONG
 
 
@@ -216,7 +216,7 @@ def _earliest_failure_ns(history: ErrorHistory, failed: int) -> int | None:
     if (judged.kind[since] == NOTHING).any():
         return None
     # Where no place along the track can be compared (NaN), any error may be.
-    may = ~(judged.largest_m <= history.config.hazards.limits.failure_m) | judged.is_wrong
+    may = ~(judged.largest_m <= judged.limit_m) | judged.is_wrong
     return int(history.t_ns[since][may[since]][0])
 
 

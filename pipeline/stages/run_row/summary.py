@@ -285,7 +285,7 @@ def _decisive(epochs: JudgedEpochs, passages: pl.DataFrame, failures: Sequence[F
         **time_in_use(epochs, config.lds.recovery_s),
         **balise_counts(passages),
         **failure_figures(failures),
-        "proof_margin_m": proof_margin_m(epochs, passages, config.hazards.limits.failure_m),
+        "proof_margin_m": proof_margin_m(epochs, passages),
     }
 
 
