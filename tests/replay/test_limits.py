@@ -145,9 +145,9 @@ def test_a_limit_that_differs_from_instant_to_instant_judges_each_by_its_own(mon
 def test_the_margin_of_a_healthy_position_is_no_wider(changed: Changed) -> None:
     """Three sigma of 5, 15 and 30 m, at most the limit."""
     sigma_m = np.array([5.0, 15.0, 30.0])
-    assert healthy_margins_m(sigma_m, HazardConfig()).tolist() == [15.0, 20.0, 20.0]
+    assert healthy_margins_m(sigma_m, np.full(3, 20.0), HazardConfig()).tolist() == [15.0, 20.0, 20.0]
     changed("healthy_m", 2.0)
-    assert healthy_margins_m(sigma_m, HazardConfig()).tolist() == [15.0, 40.0, 40.0]
+    assert healthy_margins_m(sigma_m, np.full(3, 20.0), HazardConfig()).tolist() == [15.0, 40.0, 40.0]
 
 
 def test_an_accepted_balise_that_the_one_before_contradicts_is_no_anchor(changed: Changed) -> None:

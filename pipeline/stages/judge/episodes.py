@@ -299,7 +299,7 @@ def alarm_verdict(alarm: AlarmEpisode, epochs: JudgedEpochs, healthy: Healthy, c
         can_say_false = can_say_false & healthy[axis][part]
     if judged.wrong_track.any():
         return Verdict.TRUE
-    margin_m = healthy_margins_m(epochs.sigma_along_m[part], config)
+    margin_m = healthy_margins_m(epochs.sigma_along_m[part], judged.limit_m, config)
     return verdict_of_intervals(judged.low_m, judged.high_m, margin_m, can_say_false)
 
 
@@ -335,7 +335,7 @@ def suspected_source(epochs: JudgedEpochs, begin_ns: int, end_ns: int, config: C
     first = int(np.searchsorted(epochs.t_ns, begin_ns - round(config.hazards.suspect_lookback_s * NS_PER_S)))
     part = slice(first, max(first, int(np.searchsorted(epochs.t_ns, end_ns, side="right"))))
     judged = epochs.judgements.at(part)
-    margin_m = healthy_margins_m(epochs.sigma_along_m[part], config.hazards)
+    margin_m = healthy_margins_m(epochs.sigma_along_m[part], judged.limit_m, config.hazards)
     left = (judged.least_m > margin_m) | judged.wrong_track
     if (left & (judged.kind != ODOMETER)).any():
         return Suspect.GNSS

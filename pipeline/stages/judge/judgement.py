@@ -122,9 +122,10 @@ class MatchedPositions:
         return np.isfinite(self.path_m) & np.greater_equal(self.element, 0)
 
 
-def healthy_margins_m(sigma_m: Floats, config: HazardConfig) -> Floats:
-    """Largest error of a healthy position [m]: max(5 m, min(3 sigma, failure limit))."""
-    noise = np.minimum(config.evidence_factor * np.nan_to_num(sigma_m, nan=np.inf), config.limits.healthy_m)
+def healthy_margins_m(sigma_m: Floats, failure_m: Floats, config: HazardConfig) -> Floats:
+    """Largest error of a healthy position [m]: max(5 m, min(3 sigma, failure limit)); arrays of one shape."""
+    most_m = config.limits.healthy_at_m(failure_m)
+    noise = np.minimum(config.evidence_factor * np.nan_to_num(sigma_m, nan=np.inf), most_m)
     return np.maximum(config.false_alarm_margin_m, noise)
 
 

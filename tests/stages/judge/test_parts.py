@@ -100,6 +100,16 @@ def episodes(of: ErrorHistory) -> list[Episode]:
     return find_episodes(of, find_failures(of), within_noise, None)
 
 
+def test_settled_and_within_noise_is_half_of_the_limit_that_holds_then() -> None:
+    """12 m off for 16 s, of which noise explains 30 m: within half of 24 m from 3 s on, not within half of 20 m."""
+    frame = positions(range(16), 12.0, 0.0, sigma_along_m=10.0)
+    limit_m = np.where(np.arange(16) >= 3, 24.0, 20.0)
+    judged = history(replace(frame, judgements=replace(frame.judgements, limit_m=limit_m)))
+    assert judged.within_noise.tolist() == [False] * 3 + [True] * 13
+    # Ten seconds of it have to lie ahead.
+    assert judged.settled_from.tolist() == [3, 3, 3, 3, 4, 5] + [16] * 10
+
+
 @pytest.mark.parametrize(
     ("judged", "accepted", "epoch", "may_s", "kept"),
     [
@@ -260,8 +270,9 @@ def test_an_alarm_shortly_before_a_drift_is_its_onset_and_was_there_before_it(
 
 
 def test_the_margin_of_a_healthy_position() -> None:
-    """max(5 m, min(3 sigma, 20 m)); 20 m where no sigma is known."""
-    assert healthy_margins_m(np.array([0.5, 3.0, 20.0, np.nan]), HazardConfig()).tolist() == [5.0, 9.0, 20.0, 20.0]
+    """max(5 m, min(3 sigma, limit)); the limit where no sigma is known. It is 20 m, and in the end 30 m."""
+    sigma_m, limit_m = np.array([0.5, 3.0, 20.0, np.nan, 20.0]), np.array([20.0, 20.0, 20.0, 20.0, 30.0])
+    assert healthy_margins_m(sigma_m, limit_m, HazardConfig()).tolist() == [5.0, 9.0, 20.0, 20.0, 30.0]
 
 
 def test_what_an_episode_hit() -> None:
