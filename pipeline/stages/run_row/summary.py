@@ -328,6 +328,8 @@ def failed_row(error: str, provenance: Provenance, solution: str = "") -> pl.Dat
 def _row_as_table(row: Mapping[str, object]) -> pl.DataFrame:
     """The row as a table, where nothing is NaN or infinite."""
     schema = dtypes(Runs)
+    if strange := row.keys() - schema.keys():
+        raise ValueError(f"table Runs: the contract has no column {', '.join(sorted(strange))}")
     unknown = {name for name, value in row.items() if isinstance(value, float) and not math.isfinite(value)}
     values = {name: None if name in unknown else row.get(name) for name in schema}
     # By rows: a table made of lists by column infers each column on its own, which takes five times as long.
