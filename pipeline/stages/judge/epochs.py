@@ -352,27 +352,27 @@ def judged_epochs(given: JudgeInput, steps: OdometerSteps) -> JudgedEpochs:
     error_cross_m, error_up_m = cross_errors_m(given, epochs.heading_deg)
     moves, may_move = moves_and_may_move(at_ns, reference_m, along.half_m, steps, standing, config)
     return JudgedEpochs(
-        **epochs.columns()
-        | {"direction": direction}
-        | vars(use)
-        | {
-            "epoch": np.arange(epochs.height),
-            "at_ns": at_ns,
-            "judgements": judged,
-            "true_places": true_places(evidence, given.evidence.network.track),
-            "error_along_m": judged.known_error_m(config.hazards.known_error_m),
-            "error_cross_m": error_cross_m,
-            "error_up_m": error_up_m,
-            "train_m": train_m,
-            "reference_m": reference_m,
-            "moves": moves,
-            "may_move": may_move,
-            "odometer_stood": standing,
-            "odometer_wrong": odometer_wrong,
-            "undiagnosed": undiagnosed,
-            "natural_s": use.wrong_s * ~injected,
-            "lds_state": lds_states(epochs.negated, along.code, use.in_use, undiagnosed),
-        }
+        **epochs.columns() | {"direction": direction},
+        epoch=np.arange(epochs.height),
+        at_ns=at_ns,
+        judgements=judged,
+        true_places=true_places(evidence, given.evidence.network.track),
+        error_along_m=judged.known_error_m(config.hazards.known_error_m),
+        error_cross_m=error_cross_m,
+        error_up_m=error_up_m,
+        train_m=train_m,
+        reference_m=reference_m,
+        moves=moves,
+        may_move=may_move,
+        odometer_stood=standing,
+        odometer_wrong=odometer_wrong,
+        undiagnosed=undiagnosed,
+        in_use=use.in_use,
+        used_s=use.used_s,
+        wrong_s=use.wrong_s,
+        natural_s=use.wrong_s * ~injected,
+        counted_s=use.counted_s,
+        lds_state=lds_states(epochs.negated, along.code, use.in_use, undiagnosed),
     )
 
 
