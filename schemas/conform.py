@@ -39,7 +39,7 @@ def conform(frame: pl.DataFrame, schema: type[dy.Schema]) -> pl.DataFrame:
         The table.
 
     Raises:
-        ValueError: values breach the contract: a defect of the program; all breaches in one.
+        ValueError: a column is missing, or values breach the contract: a defect of the program; all breaches in one.
     """
     table = shaped(frame, schema)
     pairs = list(zip(table, _rules(schema), strict=True))
@@ -59,9 +59,14 @@ def shaped(frame: pl.DataFrame, schema: type[dy.Schema]) -> pl.DataFrame:
 
     Returns:
         The table.
+
+    Raises:
+        ValueError: the frame lacks a column of the contract: a defect of the program.
     """
     recorded = frame.get_columns()
     series = {column.name: column for column in recorded}
+    if missing := [rule.name for rule in _rules(schema) if rule.name not in series]:
+        raise ValueError(f"table {schema.__name__}: no stage makes column {', '.join(missing)}")
     columns = [_cast(series[rule.name], rule.dtype) for rule in _rules(schema)]
     same = len(columns) == len(recorded) and all(map(is_, columns, recorded))
     return frame if same else pl.DataFrame(columns)

@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 import math
-from typing import NamedTuple, Protocol
+from typing import TYPE_CHECKING, NamedTuple, Protocol
+
+if TYPE_CHECKING:
+    from schemas.arrays import Floats
 
 
 class _Hazards(Protocol):
@@ -51,6 +54,14 @@ class Limits(NamedTuple):
     """2 F. A part of the line whose place is known less closely is unknown: the whole room of a right position."""
     clock_open_m: float
     """F. Of the room of a right position, 2 F, the clocks alone take half: `clock` is a remedy."""
+
+    def settled_at_m(self, failure_m: Floats) -> Floats:
+        """`settled_m` at instants whose failure limit is `failure_m`, in proportion to it [m]."""
+        return failure_m * (self.settled_m / self.failure_m)
+
+    def healthy_at_m(self, failure_m: Floats) -> Floats:
+        """`healthy_m` at instants whose failure limit is `failure_m`, in proportion to it [m]."""
+        return failure_m * (self.healthy_m / self.failure_m)
 
 
 def limits_of(hazards: _Hazards) -> Limits:

@@ -14,6 +14,7 @@ from pipeline.stages.epochs.verdicts import Verdicts, no_verdicts
 from pipeline.stages.evidence import TruePlaces
 from pipeline.stages.judge.judged import Judgements
 from schemas.arrays import flags, floats, ints, times_ns, truths
+from schemas.config import HazardConfig
 from schemas.enums import Evidence, Judgement, LdsMode, LdsState, LostTo, NotEvaluated, SigmaSource
 from schemas.monitors import MONITORS
 from schemas.stages import MatchedEpochs
@@ -42,6 +43,7 @@ def judgements_of_table(table: pl.DataFrame) -> Judgements:
         kind=_numbers(table, "evidence", list(Evidence)),
         wrong_track=_flags(table, "wrong_track"),
         track_assumed=_flags(table, "track_assumed"),
+        limit_m=np.full(table.height, HazardConfig().limits.failure_m),
     )
 
 

@@ -13,12 +13,12 @@ import schemas.config_judge
 from pipeline import one_run
 from pipeline.results.places import stretches_of
 from pipeline.stages.evidence.carrying import carry_from_accepted
-from pipeline.stages.judge.judgement import healthy_margins_m
+from pipeline.stages.judge.judgement import JudgeInput, healthy_margins_m
 from pipeline.stages.run_row.lost_time import LostTime, remedies
 from pipeline.studies.line.spans import SpanState, spans_of, states_of
-from schemas.arrays import NS_PER_S
+from schemas.arrays import NS_PER_S, Floats, Ints, times_ns
 from schemas.config import Configuration, HazardConfig
-from schemas.enums import Remedy
+from schemas.enums import Judgement, Remedy
 from schemas.limits import Limits, limits_of
 from schemas.run import RunLog, RunTables
 from tests.replay.journeys import MOTION, VEHICLE, journey, replay
@@ -115,12 +115,39 @@ def test_a_limit_moves_what_its_name_says(limit: str, changed: Changed) -> None:
     assert _moved(before, one_run.replay(run, site, vehicle, Configuration())) == expected
 
 
+def test_a_limit_that_differs_from_instant_to_instant_judges_each_by_its_own(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A step of 30 m from 140 to 200 s; the limit is 40 m up to 170 s, and 20 m from there on."""
+    run, site = journey(STEP)
+    until_ns = int(times_ns(run.gnss)[0]) + 170 * NS_PER_S
+
+    def with_limits(early_m: float, late_m: float) -> RunTables:
+        def failure_limit_m(_: JudgeInput, at_ns: Ints) -> Floats:
+            return np.where(at_ns < until_ns, early_m, late_m)
+
+        monkeypatch.setattr(JudgeInput, "failure_limit_m", failure_limit_m)
+        return one_run.replay(run, site, VEHICLE, Configuration())
+
+    narrow, wide, both = with_limits(20.0, 20.0), with_limits(40.0, 40.0), with_limits(40.0, 20.0)
+    early, is_wrong = both.epochs["t"].dt.timestamp("ns") < until_ns, pl.col("judgement") == Judgement.WRONG
+    for part, single in ((early, wide), (~early, narrow)):
+        assert both.epochs["judgement"].filter(part).equals(single.epochs["judgement"].filter(part), null_equal=True)
+    # The step is wrong at once by 20 m, from 170 s on by both, never by 40 m.
+    wrong_ns = [times_ns(tables.epochs.filter(is_wrong)) for tables in (narrow, both, wide)]
+    assert wrong_ns[0][0] < until_ns == wrong_ns[1][0]
+    assert wrong_ns[2].size == 0
+    # What is left up to its limit at each accepted balise, and the least of all.
+    offered_early = both.passages["t_offered"].dt.timestamp("ns") < until_ns
+    margin_m, wide_m, narrow_m = (tables.passages["proof_margin_m"] for tables in (both, wide, narrow))
+    assert margin_m.equals(wide_m.zip_with(offered_early, narrow_m), null_equal=True)
+    assert both.runs["proof_margin_m"].equals(wide.runs["proof_margin_m"])
+
+
 def test_the_margin_of_a_healthy_position_is_no_wider(changed: Changed) -> None:
     """Three sigma of 5, 15 and 30 m, at most the limit."""
     sigma_m = np.array([5.0, 15.0, 30.0])
-    assert healthy_margins_m(sigma_m, HazardConfig()).tolist() == [15.0, 20.0, 20.0]
+    assert healthy_margins_m(sigma_m, np.full(3, 20.0), HazardConfig()).tolist() == [15.0, 20.0, 20.0]
     changed("healthy_m", 2.0)
-    assert healthy_margins_m(sigma_m, HazardConfig()).tolist() == [15.0, 40.0, 40.0]
+    assert healthy_margins_m(sigma_m, np.full(3, 20.0), HazardConfig()).tolist() == [15.0, 40.0, 40.0]
 
 
 def test_an_accepted_balise_that_the_one_before_contradicts_is_no_anchor(changed: Changed) -> None:

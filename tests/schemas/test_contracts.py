@@ -184,6 +184,8 @@ def test_a_table_with_nan_or_a_forbidden_null_is_a_defect():
         conform(good.with_columns(peak_ratio=float("nan")), Alarms)
     with pytest.raises(ValueError, match="verdict holds null"):
         conform(good.with_columns(verdict=pl.lit(None)), Alarms)
+    with pytest.raises(ValueError, match=r"^table Alarms: no stage makes column peak_ratio, verdict$"):
+        conform(good.drop("verdict", "peak_ratio"), Alarms)
 
 
 def test_every_stream_has_its_columns_its_frame_and_its_key() -> None:

@@ -126,7 +126,7 @@ def _leads_back(history: ErrorHistory, jump: Jump) -> bool:
     """Whether a jump goes against the error before it and leaves an error within the failure limit."""
     judged = history.judged
     back = float(judged.middle_m[jump.first - 1]) * jump.step_m < 0.0
-    within = float(judged.least_m[jump.last]) <= history.config.hazards.limits.failure_m
+    within = float(judged.least_m[jump.last]) <= float(judged.limit_m[jump.last])
     return back and within and judged.code[jump.last] != WRONG
 
 
@@ -216,7 +216,7 @@ def _earliest_failure_ns(history: ErrorHistory, failed: int) -> int | None:
     if (judged.kind[since] == NOTHING).any():
         return None
     # Where no place along the track can be compared (NaN), any error may be.
-    may = ~(judged.largest_m <= history.config.hazards.limits.failure_m) | judged.is_wrong
+    may = ~(judged.largest_m <= judged.limit_m) | judged.is_wrong
     return int(history.t_ns[since][may[since]][0])
 
 
@@ -299,7 +299,7 @@ def alarm_verdict(alarm: AlarmEpisode, epochs: JudgedEpochs, healthy: Healthy, c
         can_say_false = can_say_false & healthy[axis][part]
     if judged.wrong_track.any():
         return Verdict.TRUE
-    margin_m = healthy_margins_m(epochs.sigma_along_m[part], config)
+    margin_m = healthy_margins_m(epochs.sigma_along_m[part], judged.limit_m, config)
     return verdict_of_intervals(judged.low_m, judged.high_m, margin_m, can_say_false)
 
 
@@ -335,7 +335,7 @@ def suspected_source(epochs: JudgedEpochs, begin_ns: int, end_ns: int, config: C
     first = int(np.searchsorted(epochs.t_ns, begin_ns - round(config.hazards.suspect_lookback_s * NS_PER_S)))
     part = slice(first, max(first, int(np.searchsorted(epochs.t_ns, end_ns, side="right"))))
     judged = epochs.judgements.at(part)
-    margin_m = healthy_margins_m(epochs.sigma_along_m[part], config.hazards)
+    margin_m = healthy_margins_m(epochs.sigma_along_m[part], judged.limit_m, config.hazards)
     left = (judged.least_m > margin_m) | judged.wrong_track
     if (left & (judged.kind != ODOMETER)).any():
         return Suspect.GNSS

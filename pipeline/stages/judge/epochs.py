@@ -352,27 +352,27 @@ def judged_epochs(given: JudgeInput, steps: OdometerSteps) -> JudgedEpochs:
     error_cross_m, error_up_m = cross_errors_m(given, epochs.heading_deg)
     moves, may_move = moves_and_may_move(at_ns, reference_m, along.half_m, steps, standing, config)
     return JudgedEpochs(
-        **epochs.columns()
-        | {"direction": direction}
-        | vars(use)
-        | {
-            "epoch": np.arange(epochs.height),
-            "at_ns": at_ns,
-            "judgements": judged,
-            "true_places": true_places(evidence, given.evidence.network.track),
-            "error_along_m": judged.known_error_m(config.hazards.known_error_m),
-            "error_cross_m": error_cross_m,
-            "error_up_m": error_up_m,
-            "train_m": train_m,
-            "reference_m": reference_m,
-            "moves": moves,
-            "may_move": may_move,
-            "odometer_stood": standing,
-            "odometer_wrong": odometer_wrong,
-            "undiagnosed": undiagnosed,
-            "natural_s": use.wrong_s * ~injected,
-            "lds_state": lds_states(epochs.negated, along.code, use.in_use, undiagnosed),
-        }
+        **epochs.columns() | {"direction": direction},
+        epoch=np.arange(epochs.height),
+        at_ns=at_ns,
+        judgements=judged,
+        true_places=true_places(evidence, given.evidence.network.track),
+        error_along_m=judged.known_error_m(config.hazards.known_error_m),
+        error_cross_m=error_cross_m,
+        error_up_m=error_up_m,
+        train_m=train_m,
+        reference_m=reference_m,
+        moves=moves,
+        may_move=may_move,
+        odometer_stood=standing,
+        odometer_wrong=odometer_wrong,
+        undiagnosed=undiagnosed,
+        in_use=use.in_use,
+        used_s=use.used_s,
+        wrong_s=use.wrong_s,
+        natural_s=use.wrong_s * ~injected,
+        counted_s=use.counted_s,
+        lds_state=lds_states(epochs.negated, along.code, use.in_use, undiagnosed),
     )
 
 
@@ -382,9 +382,10 @@ def direction_by_evidence(
     """Direction of travel of a run without an odometer, before anything is judged; shape (epochs,)."""
     at_ns = valid_at_ns(epochs.t_ns, vehicle)
     index = evidence.network.track.index
-    along = judge_positions(
-        MatchedPositions.of_epochs(epochs, index), evidence.at(at_ns), path.routes_by_leg(index), config.hazards
-    )
+    positions = MatchedPositions.of_epochs(epochs, index)
+    # Of a judgement the direction takes the interval of the error, which no limit changes.
+    limit_m = np.full(at_ns.size, config.hazards.limits.failure_m)
+    along = judge_positions(positions, evidence.at(at_ns), path.routes_by_leg(index), limit_m)
     return travel_direction(epochs.direction, along, at_ns, epochs.path_m, has_odometer=False, config=config.hazards)
 
 
@@ -421,5 +422,5 @@ def judged_offers(given: JudgeInput, epochs: JudgedEpochs) -> JudgedOffers:
         beyond_window=np.isin(rows, ints(late)),
         judged=judged,
         location_error_m=judged.known_error_m(hazards.known_error_m),
-        proof_margin_m=np.where(judged.is_right, hazards.limits.failure_m - judged.largest_m, np.nan),
+        proof_margin_m=np.where(judged.is_right, judged.limit_m - judged.largest_m, np.nan),
     )

@@ -208,7 +208,7 @@ def history_of_positions(
 
 def _settled_from(t_ns: Ints, judged: Judgements, config: HazardConfig) -> Ints:
     """Per position the number of the first one from there on that begins `episode_end_s` within half the limit."""
-    settled = (judged.largest_m <= config.limits.settled_m) & ~judged.is_wrong
+    settled = (judged.largest_m <= config.limits.settled_at_m(judged.limit_m)) & ~judged.is_wrong
     hold_ns = round(config.episode_end_s * NS_PER_S)
     begins = np.full(t_ns.size, t_ns.size)
     for first, last in spans_of(settled):
@@ -222,7 +222,8 @@ def _is_within_noise(judged: Judgements, sigma_m: Floats, config: HazardConfig) 
     """Positions at which noise explains the error: |e| <= min(3 sqrt(sigma_x^2 + sigma_ref^2), half the limit)."""
     sigma_ref_m = np.nan_to_num(judged.half_m) / config.evidence_factor
     noise_m = config.evidence_factor * np.hypot(np.nan_to_num(sigma_m), sigma_ref_m)
-    within = np.less_equal(np.abs(judged.middle_m), np.minimum(noise_m, config.limits.settled_m))
+    most_m = np.minimum(noise_m, config.limits.settled_at_m(judged.limit_m))
+    within = np.less_equal(np.abs(judged.middle_m), most_m)
     return np.logical_and(within, ~judged.is_wrong)
 
 

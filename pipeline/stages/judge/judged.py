@@ -34,7 +34,8 @@ class Judgements:
     """Per instant: judgement (number in `JUDGEMENTS`), interval of the error along the track [m], kind of evidence.
 
     Arrays of shape (instants,). Errors are along growing path until `turned`. `wrong_track`: wrong for its net element,
-    wherever along it. `track_assumed`: right if the survey holds the train's track, which nothing shows.
+    wherever along it. `track_assumed`: right if the survey holds the train's track, which nothing shows. `limit_m`: the
+    failure limit that the error is held against [m].
     """
 
     code: Ints
@@ -43,6 +44,7 @@ class Judgements:
     kind: Ints
     wrong_track: Bools
     track_assumed: Bools
+    limit_m: Floats
 
     def at(self, rows: Rows) -> Judgements:
         """The judgements of some instants, by row."""
@@ -53,6 +55,7 @@ class Judgements:
             kind=self.kind[rows],
             wrong_track=self.wrong_track[rows],
             track_assumed=self.track_assumed[rows],
+            limit_m=self.limit_m[rows],
         )
 
     def columns(self) -> list[pl.Series]:

@@ -76,6 +76,10 @@ class JudgeInput:
         """When the positions of the epochs were true [ns]."""
         return self.instants(self.solution.epochs.t_ns)
 
+    def failure_limit_m(self, at_ns: Ints) -> Floats:
+        """The failure limit at instants of the positions' clock [m], shape (instants,); all that is judged takes it."""
+        return np.full(at_ns.size, self.config.hazards.limits.failure_m)
+
     def legs(self) -> list[RoutePath]:
         """Legs of the solution's path, by the numbers of net elements that the evidence counts with."""
         return self.solution.path.routes_by_leg(self.evidence.network.track.index)
@@ -118,9 +122,10 @@ class MatchedPositions:
         return np.isfinite(self.path_m) & np.greater_equal(self.element, 0)
 
 
-def healthy_margins_m(sigma_m: Floats, config: HazardConfig) -> Floats:
-    """Largest error of a healthy position [m]: max(5 m, min(3 sigma, failure limit))."""
-    noise = np.minimum(config.evidence_factor * np.nan_to_num(sigma_m, nan=np.inf), config.limits.healthy_m)
+def healthy_margins_m(sigma_m: Floats, failure_m: Floats, config: HazardConfig) -> Floats:
+    """Largest error of a healthy position [m]: max(5 m, min(3 sigma, failure limit)); arrays of one shape."""
+    most_m = config.limits.healthy_at_m(failure_m)
+    noise = np.minimum(config.evidence_factor * np.nan_to_num(sigma_m, nan=np.inf), most_m)
     return np.maximum(config.false_alarm_margin_m, noise)
 
 
@@ -128,7 +133,7 @@ def judge_with_odometer(
     given: JudgeInput, positions: MatchedPositions, at_ns: Ints, evidence: EvidenceSet
 ) -> Judgements:
     """Judge positions by the evidence; where there is none, by the odometer since the last accepted VB."""
-    judged = judge_positions(positions, evidence, given.legs(), given.config.hazards)
+    judged = judge_positions(positions, evidence, given.legs(), given.failure_limit_m(at_ns))
     if given.odometry is None:
         return judged
     crossings = given.solution.crossings
@@ -146,11 +151,11 @@ def judge_with_odometer(
     # Where it contradicts a reference, and nobody knows which of the two failed, it shows nothing.
     unsure = inside_spans(at_ns, given.evidence.unsure)
     train_m = np.where(unsure, np.nan, low_m), np.where(unsure, np.nan, high_m)
-    return judge_by_own_anchors(judged, positions, train_m, given.config.hazards)
+    return judge_by_own_anchors(judged, positions, train_m)
 
 
 def judge_positions(
-    positions: MatchedPositions, evidence: EvidenceSet, legs: Sequence[RoutePath], config: HazardConfig
+    positions: MatchedPositions, evidence: EvidenceSet, legs: Sequence[RoutePath], limit_m: Floats
 ) -> Judgements:
     """Wrong where it is too far ahead, or too far behind, for every alternative; right where it is right for all.
 
@@ -161,7 +166,7 @@ def judge_positions(
         positions: n positions on the network.
         evidence: where the train was at the same n instants.
         legs: the legs of the solution's path; their coordinate is `path_m`.
-        config: limits of an error [m].
+        limit_m: failure limit at each of the n instants [m].
 
     Returns:
         n judgements; errors along growing path.
@@ -170,7 +175,6 @@ def judge_positions(
         DOMAIN section 5.2.
     """
     size = positions.element.size
-    limit_m = config.limits.failure_m
     low_m = np.full(size, np.inf)
     high_m = np.full(size, -np.inf)
     # True as long as it holds for every alternative seen so far.
@@ -183,10 +187,11 @@ def judge_positions(
         least_m, most_m, off_track = _compare_with_alternative(positions, sense, there, legs)
         # On another track a position is wrong only if the match was sure of its own track.
         excluded = off_track & positions.unambiguous[rows]
+        allowed_m = limit_m[rows]
         with np.errstate(invalid="ignore"):
-            ahead[rows] &= excluded | (least_m > limit_m)
-            behind[rows] &= excluded | (most_m < -limit_m)
-            right[rows] &= ~off_track & (least_m >= -limit_m) & (most_m <= limit_m)
+            ahead[rows] &= excluded | (least_m > allowed_m)
+            behind[rows] &= excluded | (most_m < -allowed_m)
+            right[rows] &= ~off_track & (least_m >= -allowed_m) & (most_m <= allowed_m)
         elsewhere[rows] &= excluded
         judged[rows] = True
         low_m[rows] = np.fmin(low_m[rows], least_m)
@@ -202,6 +207,7 @@ def judge_positions(
         kind=np.where(judged, evidence.kind, NOTHING),
         wrong_track=wrong & elsewhere,
         track_assumed=right & ~evidence.on_survey,
+        limit_m=limit_m,
     )
 
 
@@ -263,9 +269,7 @@ def _compare_along_own_path(positions: MatchedPositions, there: Alternative, leg
     return np.where(off_track, np.nan, low_m), np.where(off_track, np.nan, high_m), off_track
 
 
-def judge_by_own_anchors(
-    judged: Judgements, positions: MatchedPositions, train_m: Interval, config: HazardConfig
-) -> Judgements:
+def judge_by_own_anchors(judged: Judgements, positions: MatchedPositions, train_m: Interval) -> Judgements:
     """The judgements, where there is no other evidence by the odometer since an accepted VB.
 
     Wrong or unknown, never right. `train_m`: least and largest path position of the train.
@@ -273,8 +277,7 @@ def judge_by_own_anchors(
     rows = (judged.kind == NOTHING) & positions.known & np.isfinite(train_m[0])
     low_m = positions.path_m - train_m[1]
     high_m = positions.path_m - train_m[0]
-    limit_m = config.limits.failure_m
-    beyond = rows & ((low_m > limit_m) | (high_m < -limit_m))
+    beyond = rows & ((low_m > judged.limit_m) | (high_m < -judged.limit_m))
     return replace(
         judged,
         code=np.where(beyond, WRONG, judged.code),

@@ -219,10 +219,10 @@ def _longest_stretch_s(t_ns: Ints, used_s: Floats, where: Bools, apart_s: float)
     return max(float(used_s[part].sum()) for part in np.split(rows, breaks))
 
 
-def proof_margin_m(epochs: JudgedEpochs, passages: pl.DataFrame, limit_m: float) -> float | None:
+def proof_margin_m(epochs: JudgedEpochs, passages: pl.DataFrame) -> float | None:
     """Least proof margin of the epochs in use and the acceptances that are right [m] (DOMAIN section 5.2)."""
-    right = epochs.judgements.is_right & epochs.in_use
-    margins_m = limit_m - np.fmax(-epochs.judgements.low_m[right], epochs.judgements.high_m[right])
+    right = epochs.judgements.at(epochs.judgements.is_right & epochs.in_use)
+    margins_m = right.limit_m - np.fmax(-right.low_m, right.high_m)
     of_epochs = margins_m[np.isfinite(margins_m)].min(initial=np.inf)
     of_passages = passages.filter(is_accepted())["proof_margin_m"].min()
     margins = [float(of_epochs)] if np.isfinite(of_epochs) else []

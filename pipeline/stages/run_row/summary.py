@@ -288,7 +288,7 @@ def _decisive(epochs: JudgedEpochs, passages: pl.DataFrame, failures: Sequence[F
         **time_in_use(epochs, config.lds.recovery_s),
         **balise_counts(passages),
         **failure_figures(failures),
-        "proof_margin_m": proof_margin_m(epochs, passages, config.hazards.limits.failure_m),
+        "proof_margin_m": proof_margin_m(epochs, passages),
     }
 
 
@@ -331,6 +331,8 @@ def failed_row(error: str, provenance: Provenance, solution: str = "") -> pl.Dat
 def _row_as_table(row: Mapping[str, object]) -> pl.DataFrame:
     """The row as a table, where nothing is NaN or infinite."""
     schema = dtypes(Runs)
+    if strange := row.keys() - schema.keys():
+        raise ValueError(f"table Runs: the contract has no column {', '.join(sorted(strange))}")
     unknown = {name for name, value in row.items() if isinstance(value, float) and not math.isfinite(value)}
     values = {name: None if name in unknown else row.get(name) for name in schema}
     # By rows: a table made of lists by column infers each column on its own, which takes five times as long.

@@ -117,9 +117,8 @@ def _verdict_of_side(alarm: AlarmEpisode, side: SolutionTables, config: HazardCo
     low_m, high_m, sigma_m = (floats(known, name) for name in ("error_low_m", "error_high_m", "sigma_along_m"))
     if _is_known_wrong(alarm, side):
         return Verdict.TRUE
-    return verdict_of_intervals(
-        low_m, high_m, healthy_margins_m(sigma_m, config), np.full(known.height, side.with_truth)
-    )
+    margin_m = healthy_margins_m(sigma_m, np.full(known.height, config.limits.failure_m), config)
+    return verdict_of_intervals(low_m, high_m, margin_m, np.full(known.height, side.with_truth))
 
 
 def _is_known_wrong(alarm: AlarmEpisode, side: SolutionTables) -> bool:

@@ -100,6 +100,16 @@ def episodes(of: ErrorHistory) -> list[Episode]:
     return find_episodes(of, find_failures(of), within_noise, None)
 
 
+def test_settled_and_within_noise_is_half_of_the_limit_that_holds_then() -> None:
+    """12 m off for 16 s, of which noise explains 30 m: within half of 24 m from 3 s on, not within half of 20 m."""
+    frame = positions(range(16), 12.0, 0.0, sigma_along_m=10.0)
+    limit_m = np.where(np.arange(16) >= 3, 24.0, 20.0)
+    judged = history(replace(frame, judgements=replace(frame.judgements, limit_m=limit_m)))
+    assert judged.within_noise.tolist() == [False] * 3 + [True] * 13
+    # Ten seconds of it have to lie ahead.
+    assert judged.settled_from.tolist() == [3, 3, 3, 3, 4, 5] + [16] * 10
+
+
 @pytest.mark.parametrize(
     ("judged", "accepted", "epoch", "may_s", "kept"),
     [
@@ -260,8 +270,9 @@ def test_an_alarm_shortly_before_a_drift_is_its_onset_and_was_there_before_it(
 
 
 def test_the_margin_of_a_healthy_position() -> None:
-    """max(5 m, min(3 sigma, 20 m)); 20 m where no sigma is known."""
-    assert healthy_margins_m(np.array([0.5, 3.0, 20.0, np.nan]), HazardConfig()).tolist() == [5.0, 9.0, 20.0, 20.0]
+    """max(5 m, min(3 sigma, limit)); the limit where no sigma is known. It is 20 m, and in the end 30 m."""
+    sigma_m, limit_m = np.array([0.5, 3.0, 20.0, np.nan, 20.0]), np.array([20.0, 20.0, 20.0, 20.0, 30.0])
+    assert healthy_margins_m(sigma_m, limit_m, HazardConfig()).tolist() == [5.0, 9.0, 20.0, 20.0, 30.0]
 
 
 def test_what_an_episode_hit() -> None:
@@ -279,24 +290,27 @@ def test_what_an_episode_hit() -> None:
 
 
 @pytest.mark.parametrize(
-    ("before_m", "step_m", "after_m", "code", "back"),
+    ("before_m", "step_m", "after_m", "limit_m", "code", "back"),
     [
-        (30.0, -30.0, 0.0, RIGHT, True),
-        (-30.0, 30.0, 0.0, RIGHT, True),
-        (30.0, 30.0, 0.0, RIGHT, False),  # farther away
-        (0.1, 8.0, 8.1, RIGHT, False),  # on from a place that was hardly wrong
-        (30.0, -30.0, 20.0, UNKNOWN, True),
-        (30.0, -30.0, 20.1, UNKNOWN, False),  # still beyond the limit
-        (30.0, -30.0, 0.0, WRONG, False),  # on another track
+        (30.0, -30.0, 0.0, 20.0, RIGHT, True),
+        (-30.0, 30.0, 0.0, 20.0, RIGHT, True),
+        (30.0, 30.0, 0.0, 20.0, RIGHT, False),  # farther away
+        (0.1, 8.0, 8.1, 20.0, RIGHT, False),  # on from a place that was hardly wrong
+        (30.0, -30.0, 20.0, 20.0, UNKNOWN, True),
+        (30.0, -30.0, 20.1, 20.0, UNKNOWN, False),  # still beyond the limit
+        (30.0, -30.0, 20.1, 20.2, UNKNOWN, True),  # within the limit that holds then
+        (30.0, -30.0, 0.0, 20.0, WRONG, False),  # on another track
     ],
 )
 def test_a_jump_back_leads_to_a_place_that_is_not_wrong(
-    before_m: float, step_m: float, after_m: float, code: int, back: bool
+    before_m: float, step_m: float, after_m: float, limit_m: float, code: int, back: bool
 ) -> None:
     middle_m, hazard_size_m = np.array([before_m, 0.0]), np.array([0.0, after_m])
     low_m = np.where(np.arange(2) == 0, middle_m, hazard_size_m)
     kind, track = np.zeros(2, dtype=np.int64), np.zeros(2, dtype=bool)
-    judged = Judgements(np.array([WRONG, code]), low_m, low_m, kind, track, np.zeros(2, dtype=bool))
+    judged = Judgements(
+        np.array([WRONG, code]), low_m, low_m, kind, track, np.zeros(2, dtype=bool), np.array([20.0, limit_m])
+    )
     of_judged = history(replace(positions(range(2)), judgements=judged))
     assert bool(_leads_back(of_judged, Jump(1, 1, step_m))) is back
 
@@ -379,6 +393,13 @@ def test_since_when_a_drift_may_have_failed(
     assert _earliest_failure_ns(history(frame), 5) == ns(may_s)
 
 
+def test_a_drift_may_have_failed_since_the_limit_of_that_instant() -> None:
+    """As before, right until 0 s; of 23 m at 3 s the limit is 24 m, and of 29 m at 4 s it is 20 m."""
+    frame = positions(range(6), 6.0 * np.arange(6), 5.0, judgement=["right", *["unknown"] * 4, "wrong"])
+    judgements = replace(frame.judgements, limit_m=np.array([20.0, 20.0, 20.0, 24.0, 20.0, 20.0]))
+    assert _earliest_failure_ns(history(replace(frame, judgements=judgements)), 5) == ns(4)
+
+
 def placed(path_m: list[float], element: int = 0) -> MatchedPositions:
     """Positions on one element, whose measure is the path position."""
     at_m, size = np.array(path_m), len(path_m)
@@ -393,7 +414,7 @@ def test_each_alternative_is_weighed_however_few_instants_it_tells_of() -> None:
     alternatives = [Alternative(np.array(rows), route, np.array(low), np.array(low) + 2.0) for rows, low in (
         ([0, 1, 2, 3], [49.0] * 4), ([2], [89.0]), ([3], [89.0]))]  # fmt: skip
     evidence = proving(np.full(4, KINDS.index(Evidence.BALISE)), tuple(alternatives))
-    found = judge_positions(placed([50.0, 80.0, 50.0, np.nan]), evidence, [route], HazardConfig())
+    found = judge_positions(placed([50.0, 80.0, 50.0, np.nan]), evidence, [route], np.full(4, 20.0))
     assert found.code.tolist() == [RIGHT, WRONG, UNKNOWN, UNKNOWN]
     assert found.low_m == pytest.approx([-1.0, 29.0, -41.0, np.nan], nan_ok=True)
     assert found.high_m == pytest.approx([1.0, 31.0, 1.0, np.nan], nan_ok=True)
@@ -406,9 +427,9 @@ def test_the_odometer_since_a_balise_shows_only_what_was_wrong() -> None:
     nothing, balise = NOTHING, KINDS.index(Evidence.BALISE)
     before = np.array([nothing, nothing, balise, nothing, nothing, nothing])
     unknown = np.full(6, np.nan)
-    judged = Judgements(np.full(6, UNKNOWN), unknown, unknown, before, *np.zeros((2, 6), dtype=bool))
+    judged = Judgements(np.full(6, UNKNOWN), unknown, unknown, before, *np.zeros((2, 6), dtype=bool), np.full(6, 20.0))
     low_m = np.array([90.0, 90.0, 90.0, 90.0, np.nan, 100.0])
-    found = judge_by_own_anchors(judged, given, (low_m, low_m + 10.0), HazardConfig())
+    found = judge_by_own_anchors(judged, given, (low_m, low_m + 10.0))
     assert found.code.tolist() == [UNKNOWN, WRONG, UNKNOWN, UNKNOWN, UNKNOWN, WRONG]
     odometer = KINDS.index(Evidence.ODOMETER)
     assert found.kind.tolist() == [odometer, odometer, balise, nothing, nothing, odometer]
@@ -537,9 +558,8 @@ def along(error_m: Any, half_m: float, kind: Evidence) -> Judgements:
     """Errors along growing path."""
     size = len(error_m)
     number, track = np.full(size, KINDS.index(kind)), np.zeros(size, dtype=bool)
-    return Judgements(
-        np.full(size, RIGHT), error_m - half_m, error_m + half_m, number, track, np.zeros(size, dtype=bool)
-    )
+    sure, limit_m = np.zeros(size, dtype=bool), np.full(size, 20.0)
+    return Judgements(np.full(size, RIGHT), error_m - half_m, error_m + half_m, number, track, sure, limit_m)
 
 
 def test_without_an_odometer_the_train_turns_where_its_own_place_does() -> None:
@@ -576,7 +596,7 @@ def test_what_an_interval_of_errors_says() -> None:
     """From 4 m late to 6 m early; from 2 to 4 m early; from 9 to 5 m late, by the odometer alone."""
     kinds = np.array([KINDS.index(kind) for kind in (Evidence.REFERENCE, Evidence.BALISE, Evidence.ODOMETER)])
     low_m, high_m = np.array([-4.0, 2.0, -9.0]), np.array([6.0, 4.0, -5.0])
-    judged = Judgements(np.full(3, UNKNOWN), low_m, high_m, kinds, *np.zeros((2, 3), dtype=bool))
+    judged = Judgements(np.full(3, UNKNOWN), low_m, high_m, kinds, *np.zeros((2, 3), dtype=bool), np.full(3, 20.0))
     assert judged.middle_m.tolist() == [1.0, 3.0, -7.0]
     assert judged.half_m.tolist() == [5.0, 1.0, 2.0]
     assert judged.least_m.tolist() == [0.0, 2.0, 5.0]
@@ -598,7 +618,7 @@ def test_where_the_evidence_ends_the_position_is_held_to_it_by_its_own_path(onwa
     given = MatchedPositions(np.array([1]), at_m - 100.0, leg, at_m, sure)
     end = Alternative(np.array([0]), route(onward), np.array([95.0]), np.array([97.0]))
     evidence = proving(np.array([KINDS.index(Evidence.BALISE)]), (end,))
-    found = judge_positions(given, evidence, [route([0, 1])], HazardConfig())
+    found = judge_positions(given, evidence, [route([0, 1])], np.full(1, 20.0))
     assert found.code.tolist() == [code]
     assert found.wrong_track.tolist() == [code == WRONG]
     if code == RIGHT:

@@ -528,3 +528,8 @@ def test_shares_and_availability_are_shares(data: st.DataObject) -> None:
     assert found["availability"] is None or 0.0 <= found["availability"] <= 1.0
     both = frame.filter(pl.col("error_along_m").is_not_null() & pl.col("confidence_m").is_not_null()).height
     assert both == sum(found[f"stanford_{r}"] for r in ("nominal", "misleading", "hazardous", "unavailable"))
+
+
+def test_a_figure_without_a_column_is_a_defect() -> None:
+    with pytest.raises(ValueError, match=r"^table Runs: the contract has no column brakes, wheels$"):
+        row(epochs(seconds(3)), wheels=4, brakes=2)
