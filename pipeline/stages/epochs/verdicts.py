@@ -245,7 +245,7 @@ def _peak_ratio(monitor: Verdicts, part: slice) -> float:
 
 @frozen
 class MonitoredEpochs(AlignedEpochs, LdsEpochs):
-    """`AlignedEpochs` and `LdsEpochs` with the verdicts of all monitors, by name, in the order of the contract."""
+    """`AlignedEpochs` and `LdsEpochs` with the verdicts of all monitors, by name."""
 
     verdicts: Mapping[str, Verdicts]
 

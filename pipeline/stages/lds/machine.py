@@ -1,4 +1,8 @@
-"""The walk of the LDS along the epochs: balises offered to the linking chains, and whether the position is in use."""
+"""The walk of the LDS along the epochs.
+
+`LocationSystem` takes it epoch by epoch and holds whether the position is in use; `BaliseDetection` offers the balises
+crossed to the linking chains.
+"""
 
 from __future__ import annotations
 

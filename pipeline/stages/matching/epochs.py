@@ -1,4 +1,4 @@
-"""One solution's positions as arrays with their sigmas, and as epochs on the path."""
+"""One solution's positions as arrays with their sigmas (`fixes_of`), and as epochs on the path (`matched_epochs`)."""
 
 from __future__ import annotations
 

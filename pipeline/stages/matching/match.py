@@ -47,6 +47,87 @@ from schemas.run import Site
 from schemas.stages import ONE_TRACK_LEFT, MatchedEpochs
 
 
+@frozen
+class Match:
+    """Epochs on the path, the path, stretches in which it was in doubt, and those `off` the network.
+
+    `possible`: elements that no position refutes, in hindsight. `odometer_sign`: of the recorded odometer against
+    growing path, set here and nowhere else.
+    """
+
+    epochs: MatchedEpochs
+    path: TravelledPath
+    ambiguous: pl.DataFrame
+    off: pl.DataFrame
+    possible: Possible
+    odometer_sign: int
+
+
+def match(
+    fixes: pl.DataFrame,
+    odometry: Odometry | None,
+    site: Site,
+    vehicle: Vehicle,
+    config: MatchingConfig,
+    fix_sigma: FixSigma,
+    balise_reads: pl.DataFrame | None = None,
+) -> Match:
+    """Place one solution's epochs on the site's track.
+
+    Args:
+        fixes: `gnss` rows of one solution, in order of unique `t`, shape (n,).
+        odometry: the odometer of the run as recorded, or None.
+        site: track, links, balises and, if given, the route.
+        vehicle: places of the antennas [m].
+        config: the section `matching` of the configuration.
+        fix_sigma: standard deviations by kind of fix, for rows without a covariance [m].
+        balise_reads: telegrams received (`t`, `balise_id`), which say on which net element the train was.
+
+    Returns:
+        The epochs on the path (shape (n,)), the path, and where it was in doubt.
+
+    Raises:
+        InputError: no row has a position, or no position comes near any track.
+
+    Source:
+        DOMAIN section 2.
+    """
+    arrays = fixes_of(fixes, fix_sigma)
+    arrays = replace(arrays, height_m=arrays.height_m - vehicle.antenna_height_m)
+    if not arrays.valid.any():
+        raise InputError("no epoch has a position", place="gnss", expected="latitude, longitude and a fix")
+    network = network_in_pieces(site).unsearched()
+    read_element = read_elements(arrays, site, network.track, balise_reads)
+    rows = np.flatnonzero(arrays.valid)
+    steps = path_steps(
+        arrays.t_ns[rows],
+        arrays.points.take(rows),
+        np.sqrt(0.5 * (arrays.cov_ee_m2 + arrays.cov_nn_m2))[rows],
+        distance=None if odometry is None else odometry.distance_between,
+        independent=odometry is not None and odometry.independent,
+        read_elements=_read_elements_of_positions(read_element, rows),
+    )
+    found = path_set(steps, network, config)
+    path, assignment = find_path(arrays, odometry, found, config)
+    placed = PlacedEpochs.on_path(arrays, path, assignment)
+    element = elements_of_epochs(arrays, path, assignment, placed)
+    # The set counts from the first position, not from the first epoch.
+    since_s = (arrays.t_ns - arrays.t_ns[rows[0]]) / NS_PER_S
+    claimed = claim_tracks(found, since_s, element, np.sqrt(0.5 * (arrays.cov_ee_m2 + arrays.cov_nn_m2)), config)
+    assignment = replace(assignment, path_probability=claimed.hindsight, gate_probability=claimed.live)
+    ambiguous = doubtful_stretches(claimed, arrays.t_ns, element, read_element >= 0, network)
+    written = RecordedDigits(str(fixes["solution"][0]), *digit_deviations_m(fixes, fix_sigma.digits_least_m))
+    epochs = matched_epochs(arrays, written, path, assignment, placed, vehicle, config)
+    sign = _odometer_sign(odometry, epochs, config)
+    if sign < 0 and vehicle.gnss_antenna_ahead_m:
+        # The odometer falls when reversing (CONTRACT section 1): the leading end faces against growing path, and the
+        # antenna stays where it is on the train.
+        vehicle = vehicle.model_copy(update={"gnss_antenna_ahead_m": -vehicle.gnss_antenna_ahead_m})
+        epochs = matched_epochs(arrays, written, path, assignment, placed, vehicle, config)
+    off = off_network_stretches(claimed, epochs, config.paths_level_s)
+    return Match(epochs, path, ambiguous, off, claimed.possible, sign)
+
+
 def find_path(
     fixes: Fixes, odometry: Odometry | None, found: PathSet, config: MatchingConfig
 ) -> tuple[TravelledPath, Assignment]:
@@ -153,87 +234,6 @@ def off_the_network(fixes: Fixes, track: SurveyedTrack, config: MatchingConfig) 
 def _length_words(metres: float) -> str:
     """A length for people, in km from 10 km on."""
     return f"{metres / 1000:.0f} km" if metres >= 10_000 else f"{metres:.0f} m"
-
-
-@frozen
-class Match:
-    """Epochs on the path, the path, stretches in which it was in doubt, and those `off` the network.
-
-    `possible`: elements that no position refutes, in hindsight. `odometer_sign`: of the recorded odometer against
-    growing path, set here and nowhere else.
-    """
-
-    epochs: MatchedEpochs
-    path: TravelledPath
-    ambiguous: pl.DataFrame
-    off: pl.DataFrame
-    possible: Possible
-    odometer_sign: int
-
-
-def match(
-    fixes: pl.DataFrame,
-    odometry: Odometry | None,
-    site: Site,
-    vehicle: Vehicle,
-    config: MatchingConfig,
-    fix_sigma: FixSigma,
-    balise_reads: pl.DataFrame | None = None,
-) -> Match:
-    """Place one solution's epochs on the site's track.
-
-    Args:
-        fixes: `gnss` rows of one solution, in order of unique `t`, shape (n,).
-        odometry: the odometer of the run as recorded, or None.
-        site: track, links, balises and, if given, the route.
-        vehicle: places of the antennas [m].
-        config: the section `matching` of the configuration.
-        fix_sigma: standard deviations by kind of fix, for rows without a covariance [m].
-        balise_reads: telegrams received (`t`, `balise_id`), which say on which net element the train was.
-
-    Returns:
-        The epochs on the path (shape (n,)), the path, and where it was in doubt.
-
-    Raises:
-        InputError: no row has a position, or no position comes near any track.
-
-    Source:
-        DOMAIN section 2.
-    """
-    arrays = fixes_of(fixes, fix_sigma)
-    arrays = replace(arrays, height_m=arrays.height_m - vehicle.antenna_height_m)
-    if not arrays.valid.any():
-        raise InputError("no epoch has a position", place="gnss", expected="latitude, longitude and a fix")
-    network = network_in_pieces(site).unsearched()
-    read_element = read_elements(arrays, site, network.track, balise_reads)
-    rows = np.flatnonzero(arrays.valid)
-    steps = path_steps(
-        arrays.t_ns[rows],
-        arrays.points.take(rows),
-        np.sqrt(0.5 * (arrays.cov_ee_m2 + arrays.cov_nn_m2))[rows],
-        distance=None if odometry is None else odometry.distance_between,
-        independent=odometry is not None and odometry.independent,
-        read_elements=_read_elements_of_positions(read_element, rows),
-    )
-    found = path_set(steps, network, config)
-    path, assignment = find_path(arrays, odometry, found, config)
-    placed = PlacedEpochs.on_path(arrays, path, assignment)
-    element = elements_of_epochs(arrays, path, assignment, placed)
-    # The set counts from the first position, not from the first epoch.
-    since_s = (arrays.t_ns - arrays.t_ns[rows[0]]) / NS_PER_S
-    claimed = claim_tracks(found, since_s, element, np.sqrt(0.5 * (arrays.cov_ee_m2 + arrays.cov_nn_m2)), config)
-    assignment = replace(assignment, path_probability=claimed.hindsight, gate_probability=claimed.live)
-    ambiguous = doubtful_stretches(claimed, arrays.t_ns, element, read_element >= 0, network)
-    written = RecordedDigits(str(fixes["solution"][0]), *digit_deviations_m(fixes, fix_sigma.digits_least_m))
-    epochs = matched_epochs(arrays, written, path, assignment, placed, vehicle, config)
-    sign = _odometer_sign(odometry, epochs, config)
-    if sign < 0 and vehicle.gnss_antenna_ahead_m:
-        # The odometer falls when reversing (CONTRACT section 1): the leading end faces against growing path, and the
-        # antenna stays where it is on the train.
-        vehicle = vehicle.model_copy(update={"gnss_antenna_ahead_m": -vehicle.gnss_antenna_ahead_m})
-        epochs = matched_epochs(arrays, written, path, assignment, placed, vehicle, config)
-    off = off_network_stretches(claimed, epochs, config.paths_level_s)
-    return Match(epochs, path, ambiguous, off, claimed.possible, sign)
 
 
 def elements_of_epochs(fixes: Fixes, path: TravelledPath, assignment: Assignment, placed: PlacedEpochs) -> Ints:

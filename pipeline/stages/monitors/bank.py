@@ -46,6 +46,18 @@ class AxisBank:
     thresholds): per epoch and monitor (raw, then the EWMAs), NaN where there is none. `noise_known`: no failure can
     hide in it; true where the axis has no row. `enabled`: which of the monitors are. `blind`: why none of them can say
     that all is well, None where they can.
+
+    Rows are evaluated in blocks ahead of the LDS, which then may take back what lies ahead. An example, with a row at
+    each epoch:
+
+    1. Asked for epoch 0, the axis evaluates rows 0 to 8191, and its noise is known at row 5000.
+    2. A monitor fails there and the LDS negates: `freeze(5000)`. Rows from 5000 on are under alarm and no longer enter
+       the noise, so the thresholds behind 5000, made with them, are void. The state of the recursions is kept at the
+       begin of a block alone, here row 0: evaluated anew are 0 to 2047 and 2048 to 6143, as far as the LDS asks. Rows
+       before 5000 come out as they were.
+    3. The position returns: `restart(5300)`. Row 5300 becomes `fresh`, and 5300 to 7347 are evaluated without what the
+       averages held before it. What stands at 5299 and before stays. The noise keeps its samples of before 5000, and
+       those whose three rows lie at 5300 or behind it count again.
     """
 
     def __init__(self, axis: Axis, epochs: int, config: Configuration, blind: NotEvaluated | None = None) -> None:
@@ -294,7 +306,7 @@ class MonitorBank:
         return {name: noise_m for name, noise_m in shown.items() if noise_m}
 
     def verdicts(self) -> dict[str, Verdicts]:
-        """Verdicts of each monitor of the bank by name, in the order of the columns of `epochs`."""
+        """Verdicts of each monitor of the bank by name."""
         self._look_to_the_end()
         return {name: found for axis in self._axes for name, found in axis.verdicts().items()} | self._single
 
