@@ -437,6 +437,9 @@ def test_the_odometer_since_a_balise_shows_only_what_was_wrong() -> None:
     assert found.high_m[[0, 1, 5]].tolist() == [25.0, 31.0, -21.0]
     # In the direction of travel: against growing path what is ahead is behind.
     turned = found.turned(np.array([1, -1, 1, 1, 1, -1]))
+    # Each is held against its own limit: 21 m and more off is not wrong by 21 m, 31 to 21 m behind not by 22 m.
+    wider = replace(judged, limit_m=np.array([20.0, 21.0, 20.0, 20.0, 20.0, 22.0]))
+    assert judge_by_own_anchors(wider, given, (low_m, low_m + 10.0)).code.tolist() == [UNKNOWN] * 6
     assert turned.low_m[[0, 1, 5]].tolist() == [15.0, -31.0, 21.0]
     assert turned.high_m[[0, 1, 5]].tolist() == [25.0, -21.0, 31.0]
 
@@ -832,6 +835,20 @@ def test_whether_an_alarm_was_due(error_m: float, half_m: float, evidence: str, 
     # What comes after the alarm says nothing of it.
     early = AlarmEpisode(2, 2, 2 * NS, 2 * NS, (monitor,), 2.0)
     assert alarm_verdict(early, epochs, within_noise_across(epochs, config), config) is not Verdict.TRUE
+
+
+def test_by_which_limit_an_alarm_was_due_and_positions_are_suspected() -> None:
+    """25 m off at 5 s, noise explains 30 m: beyond the margin where the limit is 20 m, not where it is 26 m."""
+    error_m = np.where(np.arange(10) == 5, 25.0, 0.0)
+    epochs = positions(range(10), error_m, sigma_along_m=10.0, gate_probability=1.0)
+    at_6_s = AlarmEpisode(6, 6, 6 * NS, 6 * NS, ("along_raw",), 2.0)
+    found = []
+    for limit_m in (20.0, 26.0):
+        limits_m = np.where(np.arange(10) == 5, limit_m, 20.0)
+        held = replace(epochs, judgements=replace(epochs.judgements, limit_m=limits_m))
+        due = alarm_verdict(at_6_s, held, within_noise_across(held, HazardConfig()), HazardConfig())
+        found.append((due, suspected_source(held, 6 * NS, 6 * NS, Configuration())))
+    assert found == [(Verdict.TRUE, Suspect.GNSS), (Verdict.FALSE, Suspect.UNKNOWN)]
 
 
 @pytest.mark.parametrize(
