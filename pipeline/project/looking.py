@@ -117,7 +117,7 @@ def _look_at_run(path: Path, config: IngestConfig) -> InspectedLog:
     if path.suffix.lower() == ".mcap":
         own = mappings_of_topics(config, path)
         census = Census()
-        run = read_part([path], own, partly=True, beside=[census])
+        run = read_part([path], own, partly=True, observers=[census])
         parts = tuple(parts_of_topics(path.name, topics_in([census], own), run.notes.skipped_topics))
     else:
         run = read_run(path, config, with_digest=False)

@@ -82,13 +82,13 @@ def note_all_below(folder: Path) -> None:
     if _NOTED.get() is None:
         return
     note(folder)
-    seen = {os.path.realpath(folder)}
+    visited = {os.path.realpath(folder)}
     for place, below, names in os.walk(folder, followlinks=True):
         for name in (".", *names):
             note(Path(place, name))
         real = {name: os.path.realpath(Path(place, name)) for name in below}
-        below[:] = [name for name in below if real[name] not in seen]
-        seen.update(real.values())
+        below[:] = [name for name in below if real[name] not in visited]
+        visited.update(real.values())
 
 
 @contextmanager

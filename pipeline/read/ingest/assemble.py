@@ -167,22 +167,22 @@ def _without_unset(frame: pl.DataFrame, source: Source) -> pl.DataFrame:
         return frame
     contract = STREAM_SCHEMAS[source.recipe.stream].columns()
     names = [name for name in source.implicit if contract[name].nullable and frame[name].dtype.is_numeric()]
-    silent = [name for name in names if not (frame[name] != 0).any()]
-    if "speed_mps" in silent and not _gives_distance(frame, silent):  # a train that stands says so
-        silent.remove("speed_mps")
-    empty = [pl.lit(None, dtype=frame[name].dtype).alias(name) for name in silent]
+    zero_columns = [name for name in names if not (frame[name] != 0).any()]
+    if "speed_mps" in zero_columns and not _gives_distance(frame, zero_columns):  # a train that stands says so
+        zero_columns.remove("speed_mps")
+    empty = [pl.lit(None, dtype=frame[name].dtype).alias(name) for name in zero_columns]
     zero = [
         pl.when(pl.col(name) != 0).then(name).alias(name)
         for name in names
-        if name in _NEVER_ZERO and name not in silent
+        if name in _NEVER_ZERO and name not in zero_columns
     ]
     text = [pl.col(name).replace("", None) for name in (*DEFAULTS, "origin") if name in source.implicit]
     return frame.with_columns(*empty, *zero, *text)
 
 
-def _gives_distance(frame: pl.DataFrame, silent: Sequence[str]) -> bool:
-    """Whether the odometer gives a distance, apart from the `silent` columns."""
-    return "distance_m" in set(frame.columns) - set(silent) and frame["distance_m"].null_count() < frame.height
+def _gives_distance(frame: pl.DataFrame, zero_columns: Sequence[str]) -> bool:
+    """Whether the odometer gives a distance, apart from the `zero_columns`."""
+    return "distance_m" in set(frame.columns) - set(zero_columns) and frame["distance_m"].null_count() < frame.height
 
 
 def _without_zero_stamps(frame: pl.DataFrame, source: Source, remarks: list[str]) -> pl.DataFrame:

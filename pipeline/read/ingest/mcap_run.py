@@ -118,18 +118,18 @@ def read_mcaps(
     config: IngestConfig,
     with_digest: bool = False,
     partly: bool = False,
-    beside: Sequence[BlockSink] = (),
+    observers: Sequence[BlockSink] = (),
 ) -> RunLog:
     """All streams of a log that a recorder split into several files, in order; the digest is of the first.
 
     A topic need not be in each of them. `partly`: the log is one of several of a run; it need not hold positions, nor
-    all topics that are mapped. `beside`: by file, what else looks at its messages on the same walk.
+    all topics that are mapped. `observers`: by file, what else looks at its messages on the same walk.
     """
     logs: list[_WalkedLog] = []
     for number, path in enumerate(paths):
         streams = McapStreams(config)
         ordinal = logs[-1].walk.next_ordinal if logs else 0
-        sink = _Sinks([streams, *beside[number : number + 1]])
+        sink = _Sinks([streams, *observers[number : number + 1]])
         try:
             walk, digest = walk_log(path, config, sink, with_digest, ordinal)
         finally:
@@ -174,9 +174,9 @@ def _partial_until_ns(logs: Sequence[_WalkedLog], gnss: pl.DataFrame) -> int | N
     if not cut:
         return None
     if gnss.is_empty():
-        return max((span_ns[1] for log in cut if (span_ns := log.walk.met.span_ns) is not None), default=None)
+        return max((span_ns[1] for log in cut if (span_ns := log.walk.counts.span_ns) is not None), default=None)
     last_ns: int = times_ns(gnss).max().item()
-    ends_ns = [span_ns[1] for log in cut if log is not logs[-1] and (span_ns := log.walk.met.span_ns) is not None]
+    ends_ns = [span_ns[1] for log in cut if log is not logs[-1] and (span_ns := log.walk.counts.span_ns) is not None]
     return min(last_ns, *ends_ns) if ends_ns else last_ns
 
 
@@ -232,12 +232,12 @@ def _frames(
     """
     place = str(logs[0].path) if len(logs) == 1 else ", ".join(str(log.path) for log in logs)
     readers = [reader for log in logs for of_channel in log.streams.readers.values() for reader in of_channel]
-    met = [log.walk.channels[channel_id] for log in logs for channel_id in log.streams.readers]
-    settled = settle_sources([reader.source for reader in readers], [c.topic for c in met], config, place, partly)
+    channels = [log.walk.channels[channel_id] for log in logs for channel_id in log.streams.readers]
+    settled = settle_sources([reader.source for reader in readers], [c.topic for c in channels], config, place, partly)
     chosen = [reader for reader in readers if any(reader.source is source for source in settled)]
     decoded = [DecodedRows(r.source, solution_of(r.source, settled), r.frame(), [*r.frames]) for r in chosen]
     used = {source.channel.topic for source in settled}
-    unused = {channel.topic: channel.schema_name for channel in met if channel.topic not in used}
+    unused = {channel.topic: channel.schema_name for channel in channels if channel.topic not in used}
     left_over = tuple(f"{topic} ({schema})" if schema else topic for topic, schema in sorted(unused.items()))
     breaches: list[InputError] = []
     remarks: list[str] = []
@@ -284,7 +284,7 @@ def _no_gnss(logs: Sequence[_WalkedLog], left_over: tuple[str, ...]) -> InputErr
     """The error for logs without a GNSS stream: cut off before any message, or with these topics left over."""
     place = ", ".join(str(log.path) for log in logs)
     walk = logs[0].walk
-    if walk.cut_at is not None and not any(log.walk.met.message_counts for log in logs):
+    if walk.cut_at is not None and not any(log.walk.counts.message_counts for log in logs):
         return InputError(
             f"is cut off at byte {walk.cut_at}, before any complete message",
             place=place,

@@ -112,10 +112,10 @@ class Summary:
     `lost`: what it declares beyond that.
     """
 
-    def __init__(self, start: int, met: WalkCounts, channels: Mapping[int, Channel]) -> None:
+    def __init__(self, start: int, counted: WalkCounts, channels: Mapping[int, Channel]) -> None:
         self.lost: list[str] = []
         self._start = start
-        self._met = met
+        self._counted = counted
         self._channels = channels
         self._stated_chunks: int | None = None
         self._crc = 0
@@ -133,12 +133,12 @@ class Summary:
 
     def _check_statistics(self, stated: Statistics, position: int) -> None:
         """Fewer records than stated are a loss, which is said; everything else that differs is a contradiction."""
-        met = self._met
+        counted = self._counted
         per_channel = {channel: count for channel, count in stated.channel_message_counts.items() if count}
-        counts = dict(met.message_counts)
+        counts = dict(counted.message_counts)
         pairs: list[tuple[str, object, object]] = [
-            ("attachments", stated.attachment_count, met.attachments),
-            ("metadata records", stated.metadata_count, met.metadata),
+            ("attachments", stated.attachment_count, counted.attachments),
+            ("metadata records", stated.metadata_count, counted.metadata),
         ]
         if _is_less(counts, per_channel or counts) and counts != (per_channel or counts):
             lost = [(channel, counts.get(channel, 0), count) for channel, count in sorted(per_channel.items())]
@@ -146,23 +146,23 @@ class Summary:
         elif per_channel:
             pairs.append(("messages per channel", per_channel, counts))
         for name, held, count in (
-            ("messages", met.message_counts.total(), stated.message_count),
-            ("chunks", len(met.chunks), stated.chunk_count),
+            ("messages", counted.message_counts.total(), stated.message_count),
+            ("chunks", len(counted.chunks), stated.chunk_count),
         ):
             if held < count:
                 self.lost += [_loss(name, held, count)] if name == "chunks" or not self.lost else []
             else:
                 pairs.append((name, count, held))
         self._stated_chunks = stated.chunk_count
-        if met.span_ns:
+        if counted.span_ns:
             # Some writers take a first time of 0 for none yet, and state the earliest after it.
-            start_ns = stated.message_start_time if met.span_ns[0] else 0
+            start_ns = stated.message_start_time if counted.span_ns[0] else 0
             span_ns = (start_ns, stated.message_end_time)
-            if not (self.lost and start_ns <= met.span_ns[0] and met.span_ns[1] <= span_ns[1]):
-                pairs.append(("times", span_ns, met.span_ns))
-        for name, recorded, counted in pairs:
-            if recorded != counted:
-                raise DamageError(position, f"the statistics record gives {recorded} {name}, the file holds {counted}")
+            if not (self.lost and start_ns <= counted.span_ns[0] and counted.span_ns[1] <= span_ns[1]):
+                pairs.append(("times", span_ns, counted.span_ns))
+        for name, recorded, found in pairs:
+            if recorded != found:
+                raise DamageError(position, f"the statistics record gives {recorded} {name}, the file holds {found}")
 
     def _topic(self, channel_id: int) -> str:
         """The topic of a channel, or its number where the channel is not known."""
@@ -181,18 +181,18 @@ class Summary:
         lost_before = self._lost_before(missing, position)
         if missing and not self.lost:
             raise elsewhere
-        self._met.explain(lost_before)
+        self._counted.explain(lost_before)
 
     def _lost_before(self, missing: int, position: int) -> set[int]:
         """Before which chunks others were lost, as the chunk index shows; `lost` names them where nothing else did."""
-        met = self._met.chunks
+        counted = self._counted.chunks
         listed = self._listed.sorted()
-        if not len(listed) or listed.is_same(met):
+        if not len(listed) or listed.is_same(counted):
             return set()
-        lost_before = met.lost_of(listed, missing)
+        lost_before = counted.lost_of(listed, missing)
         if not lost_before or self._stated_chunks not in (None, len(listed)):
             raise DamageError(position, "the chunk index disagrees with the chunks")
-        self.lost = self.lost or [_loss("chunks", len(met), len(listed))]
+        self.lost = self.lost or [_loss("chunks", len(counted), len(listed))]
         return lost_before
 
 

@@ -64,7 +64,7 @@ class McapWalk:
         first_ordinal: int = 0,
     ) -> None:
         self.channels: dict[int, Channel] = {}
-        self.met = WalkCounts()
+        self.counts = WalkCounts()
         self.cut_at: int | None = None
         self.without_crc = 0  # blocks of messages whose content no checksum covers
         self._bare_chunks = array("q")  # contents of chunks without checksum, from and to
@@ -96,7 +96,7 @@ class McapWalk:
     def message_counts(self) -> dict[str, int]:
         """Messages that were met, by topic."""
         counts: Counter[str] = Counter()
-        for channel_id, count in self.met.message_counts.items():
+        for channel_id, count in self.counts.message_counts.items():
             counts[self.channels[channel_id].topic] += count
         return dict(counts)
 
@@ -112,7 +112,7 @@ class McapWalk:
             damage = error
         if self._pieces:
             yield self._block()
-        for contradiction in [*self.met.unexplained, *filter(None, [damage])]:
+        for contradiction in [*self.counts.unexplained, *filter(None, [damage])]:
             raise contradiction
 
     def _walked(self) -> Iterator[Block]:
@@ -175,7 +175,7 @@ class McapWalk:
     def _record(self, opcode: int, length: int, position: int) -> int:
         """Meet one record of the data section; the position of the next."""
         if opcode == Opcode.MESSAGE_INDEX:
-            self.met.add_orphan(DamageError(position, "a message index does not follow a chunk"))
+            self.counts.add_orphan(DamageError(position, "a message index does not follow a chunk"))
         if opcode == Opcode.MESSAGE:
             return self._loose_messages(length, position)
         if opcode == Opcode.CHUNK:
@@ -183,9 +183,9 @@ class McapWalk:
         if opcode in _ONLY_THERE:
             raise DamageError(position, f"a {Opcode(opcode).name} record is not allowed in the data section")
         if opcode == Opcode.ATTACHMENT:  # passed by
-            self.met.attachments += 1
+            self.counts.attachments += 1
         elif opcode == Opcode.METADATA:
-            self.met.metadata += 1
+            self.counts.metadata += 1
         elif opcode <= _KNOWN:
             self._of_data(opcode, self._body(opcode, length, position), position)
         return position + HEAD_SIZE + length
@@ -200,7 +200,7 @@ class McapWalk:
             parse(records.Header, body, position)
         elif opcode == Opcode.DATA_END:
             self._data_end(parse(records.DataEnd, body, position).data_section_crc, position)
-            self._summary = Summary(position + HEAD_SIZE + len(body), self.met, self.channels)
+            self._summary = Summary(position + HEAD_SIZE + len(body), self.counts, self.channels)
 
     def _body(self, opcode: int, length: int, position: int) -> bytes:
         """No record that is loaded whole may be larger than a chunk."""
@@ -252,8 +252,9 @@ class McapWalk:
         record = HEAD_SIZE + len(body)
         content = unpacked(chunk, position)
         indexes, end = self._indexes(end, position, size)
-        self.met.chunks.add(chunk, position, record, record)
-        self._keep(piece_of_chunk(content, position, self._chunk_record, self._allowance, indexes, self.met.add_orphan))
+        self.counts.chunks.add(chunk, position, record, record)
+        orphan = self.counts.add_orphan
+        self._keep(piece_of_chunk(content, position, self._chunk_record, self._allowance, indexes, orphan))
         return end
 
     def _indexes(self, position: int, chunk: int, room: int) -> tuple[list[tuple[int, memoryview]], int]:
@@ -301,11 +302,11 @@ class McapWalk:
         for channel_id, messages in block.items():
             if channel_id not in self.channels:
                 self._define_lost(channel_id, pieces[0].offset)
-            self.met.message_counts[channel_id] += len(messages)
+            self.counts.message_counts[channel_id] += len(messages)
             first, last = int(messages.log_time.min()), int(messages.log_time.max())
             if first < 0:
                 raise DamageError(pieces[0].offset, "a log time behind it is beyond the year 2262")
-            self.met.add_times(first, last)
+            self.counts.add_times(first, last)
         self._ordinal += sum(piece.size for piece in pieces)
         return block
 
@@ -324,7 +325,7 @@ class McapWalk:
             position += HEAD_SIZE + length
         if channel_id not in self.channels:
             raise unknown
-        self.met.undefined = unknown
+        self.counts.undefined = unknown
 
     def _data_end(self, crc: int, end: int) -> None:
         """The checksum over the whole data section, which few recorders write.
@@ -338,7 +339,7 @@ class McapWalk:
         elif self._bare_chunks and self._crc_of(end, self._bare_chunks) == crc:
             self.without_crc = len(self._bare_chunks) // 2
         else:
-            self.met.checksum = DamageError(end, "the checksum of the data section does not match")
+            self.counts.checksum = DamageError(end, "the checksum of the data section does not match")
 
     def _crc_of(self, end: int, left_out: array[int]) -> int:
         """CRC-32 of the file up to `end`, without some parts (each from and to)."""

@@ -42,10 +42,10 @@ def read_run(path: Address, config: IngestConfig = _DEFAULTS, with_digest: bool 
 
 
 def read_part(
-    paths: Sequence[Address], config: IngestConfig, partly: bool = False, beside: Sequence[BlockSink] = ()
+    paths: Sequence[Address], config: IngestConfig, partly: bool = False, observers: Sequence[BlockSink] = ()
 ) -> RunLog:
     """The run in MCAP files of one log, which may be one of several of a run (`read_mcaps`), read as by `read_run`."""
-    run = read_mcaps(paths, config, partly=partly, beside=beside)
+    run = read_mcaps(paths, config, partly=partly, observers=observers)
     return correct_run(_require_limits(run, paths[0], config), config.correct, later=partly)
 
 

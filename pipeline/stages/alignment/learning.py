@@ -283,7 +283,7 @@ class _Learner:
             away_m = away_m[-1] + np.cumsum(series.rate_mps * series.dt_s)
             variance_m2 = self._drift_m2(begin, row, end, scale_sigma)
             near = np.abs(away_m) <= self._rule.bound_m(variance_m2)
-            back = np.flatnonzero(near & self._rule.is_quiet(t_s - failed_s))
+            back = np.flatnonzero(near & self._rule.recovery_is_over(t_s - failed_s))
             if back.size:
                 first = int(back[0])
                 return row + first, float(away_m[first] ** 2 + variance_m2[first])

@@ -339,7 +339,7 @@ def suspected_source(epochs: JudgedEpochs, begin_ns: int, end_ns: int, config: C
     left = (judged.least_m > margin_m) | judged.wrong_track
     if (left & (judged.kind != ODOMETER)).any():
         return Suspect.GNSS
-    contradicted = epochs.odometer_stood[part] | epochs.odometer_wrong[part]
+    contradicted = epochs.odometer_standing[part] | epochs.odometer_wrong[part]
     if contradicted.any() or _leave_odometer_together(epochs, part, margin_m, config):
         return Suspect.ODOMETER
     if left.any():

@@ -364,7 +364,7 @@ def judged_epochs(given: JudgeInput, steps: OdometerSteps) -> JudgedEpochs:
         reference_m=reference_m,
         moves=moves,
         may_move=may_move,
-        odometer_stood=standing,
+        odometer_standing=standing,
         odometer_wrong=odometer_wrong,
         undiagnosed=undiagnosed,
         in_use=use.in_use,

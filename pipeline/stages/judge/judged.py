@@ -144,7 +144,7 @@ class JudgedEpochs(MonitoredEpochs):
     """The train moves from here to the next epoch, as is known."""
     may_move: Bools
     """It does, or nobody knows (DOMAIN section 5.5)."""
-    odometer_stood: Bools
+    odometer_standing: Bools
     """The odometer stood while positions left their place by more than the failure limit."""
     odometer_wrong: Bools
     """The distance since the last accepted VB is beyond 5 m + 5 % by the evidence."""

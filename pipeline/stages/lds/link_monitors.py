@@ -223,7 +223,7 @@ class Recovery:
             self._observed_at_ns = t_ns
         if failing or self._bank.fast_failed(epoch):
             self._failed_at_ns = t_ns
-        quiet = bool(self._rule.is_quiet((t_ns - self._failed_at_ns) / NS_PER_S))
+        quiet = bool(self._rule.recovery_is_over((t_ns - self._failed_at_ns) / NS_PER_S))
         return observed and usable and quiet
 
 
@@ -322,7 +322,7 @@ class LinkDistance:
         self._evaluate_up_to(self._anchor, epoch)
         return bool(self._fails[epoch])
 
-    def quiet_until(self, epoch: int, end: int) -> int:
+    def first_alarm_from(self, epoch: int, end: int) -> int:
         """The first epoch from `epoch` on that fails or is not evaluated yet; at most `end`."""
         if self._anchor is None:
             return end

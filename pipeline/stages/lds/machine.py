@@ -243,7 +243,7 @@ class LocationSystem:
             return epoch
         end = self._next_event(epoch)
         for monitors in (self._bank, self.distance):
-            end = monitors.quiet_until(epoch, end) if end > epoch else epoch
+            end = monitors.first_alarm_from(epoch, end) if end > epoch else epoch
         return self._first_window_end(epoch, end)
 
     def _next_event(self, epoch: int) -> int:

@@ -300,13 +300,13 @@ def run_axis(
     responses = [linear_recurrence(keep, weight * rate_mps[:, None], before) for rate_mps, before in lasting]
     averaged_m2 = variance + noise + sum(response**2 for response in responses)
     raw_m2 = _raw_variance(series, increment_m2 + 2.0 * known_m2[:, 0])
-    sigma = np.sqrt(_beside(raw_m2, averaged_m2))
+    sigma = np.sqrt(_stack_columns(raw_m2, averaged_m2))
     sigma[unknown] = np.nan
     carried = np.array([response[-1] for response in responses]).reshape(state.lasting.shape)
-    return _beside(series.rate_mps, ewma), sigma, AxisState(ewma[-1], *smooth, *fast, carried)
+    return _stack_columns(series.rate_mps, ewma), sigma, AxisState(ewma[-1], *smooth, *fast, carried)
 
 
-def _beside(raw: Floats, averages: Floats) -> Floats:
+def _stack_columns(raw: Floats, averages: Floats) -> Floats:
     """The raw monitor's column before those of the averages, in Fortran order."""
     return np.vstack([raw[None, :], averages.T]).T
 

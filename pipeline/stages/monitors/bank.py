@@ -249,7 +249,7 @@ class MonitorBank:
         self._look(epoch)
         return bool(self._along[epoch])
 
-    def quiet_until(self, epoch: int, end: int) -> int:
+    def first_alarm_from(self, epoch: int, end: int) -> int:
         """The first epoch from `epoch` on, at most `end`, at which something fails, begins or is not known yet."""
         self._look(epoch)
         ahead = self._stops[epoch : min(self._known_to + 1, end)]
@@ -265,7 +265,7 @@ class MonitorBank:
         return epoch + (first if shown[first] else shown.size)
 
     def along_evaluated_between(self, epoch: int, end: int) -> Bools:
-        """Whether the axis along is evaluated at epochs for which `quiet_until` answered."""
+        """Whether the axis along is evaluated at epochs for which `first_alarm_from` answered."""
         return self._along[epoch:end]
 
     def noise_known_at(self, epoch: int) -> bool:

@@ -385,9 +385,9 @@ class RecoveryRule:
         """Half of the failure limit [m]: no bound is wider, and no more may be in doubt."""
         return self.config.hazards.limits.relink_m
 
-    def is_quiet(self, quiet_s: float | Floats) -> Bools:
-        """No fast monitor failed for `lds.recovery_s`; `quiet_s`: time since the last fast failure [s]."""
-        return np.asarray(quiet_s) >= self.config.lds.recovery_s
+    def recovery_is_over(self, since_failure_s: float | Floats) -> Bools:
+        """Whether no fast monitor failed for `lds.recovery_s`; `since_failure_s`: time since the last one [s]."""
+        return np.asarray(since_failure_s) >= self.config.lds.recovery_s
 
     def variance_m2(self, positions_m2: Number, elapsed_s: Number, distance_m: Number, sigma_scale: float) -> Number:
         """What GNSS minus odometer moves by without a fault.

@@ -169,8 +169,8 @@ def missed_detection() -> pl.Expr:
 
 def earliest_failure() -> pl.Expr:
     """Expression on hazards: earliest begin of a failure; null where the evidence is silent for one that failed."""
-    silent = pl.col("t_failure").is_not_null() & pl.col("t_failure_may").is_null()
-    return pl.when(~silent.any()).then(pl.col("t_failure_may").min())
+    without_evidence = pl.col("t_failure").is_not_null() & pl.col("t_failure_may").is_null()
+    return pl.when(~without_evidence.any()).then(pl.col("t_failure_may").min())
 
 
 def independent_episodes(hazards: pl.DataFrame) -> pl.DataFrame:

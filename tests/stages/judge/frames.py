@@ -78,7 +78,7 @@ _KINDS: dict[str, pl.DataType] = {
     "evidence": pl.Enum(Evidence),
     "balise_id": pl.String(),
     **{name: pl.Boolean() for name in ("wrong_track", "track_assumed", "virtual", "offered", "accepted")},
-    **{name: pl.Boolean() for name in ("beyond_window", "odometer_stood", "odometer_wrong")},
+    **{name: pl.Boolean() for name in ("beyond_window", "odometer_standing", "odometer_wrong")},
     **{name: pl.Int64() for name in ("epoch", "crossing_id", "direction", "leg")},
 }
 

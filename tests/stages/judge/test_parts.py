@@ -349,7 +349,7 @@ def test_who_is_suspected(
     """Ten epochs, of which the sixth tells; an alarm at 6 s. The odometer and the Doppler are silent."""
     at_fault = np.arange(10) == 5
     epochs = positions(
-        range(10), np.where(at_fault, error_m, 0.0), 0.0, evidence=kind.value, odometer_stood=at_fault & stood,
+        range(10), np.where(at_fault, error_m, 0.0), 0.0, evidence=kind.value, odometer_standing=at_fault & stood,
         odometer_wrong=at_fault & counted_wrong, gate_probability=np.where(~at_fault | sure, 1.0, 0.5),
     )  # fmt: skip
     assert suspected_source(epochs, 6 * NS, 6 * NS, Configuration()) is suspect

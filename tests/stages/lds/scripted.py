@@ -75,7 +75,7 @@ class ScriptedBank:
     def hidden_until(self, epoch: int, end: int) -> int:
         return next((k for k in range(epoch, end) if k not in self.unknown or self.failed(k)), end)
 
-    def quiet_until(self, epoch: int, end: int) -> int:
+    def first_alarm_from(self, epoch: int, end: int) -> int:
         return next((k for k in range(epoch, end) if not self._quiet(k)), end)
 
     def _quiet(self, epoch: int) -> bool:

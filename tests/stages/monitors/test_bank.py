@@ -250,4 +250,4 @@ def test_quiet_until_the_next_fail_or_the_end_of_what_is_known(epoch: int, end: 
     """Fails at the fourth and the ninth epoch; ten are known."""
     fails = np.isin(np.arange(10), [4, 8])
     bank = SimpleNamespace(_look=lambda _: None, _stops=fails, _known_to=9)
-    assert MonitorBank.quiet_until(cast(Any, bank), epoch, end) == quiet
+    assert MonitorBank.first_alarm_from(cast(Any, bank), epoch, end) == quiet

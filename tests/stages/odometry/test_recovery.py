@@ -36,4 +36,4 @@ def test_the_bound_is_of_both_positions_and_the_odometer_up_to_half_the_failure_
 def test_the_failure_limit_and_the_recovery_time_are_those_of_the_configuration() -> None:
     rule = RecoveryRule(Configuration(hazards=HazardConfig(failure_limit_m=6.0)))
     assert float(rule.bound_m(4.0)) == 3.0
-    assert RULE.is_quiet(np.array([0.0, 29.9, 30.0, 31.0])).tolist() == [False, False, True, True]
+    assert RULE.recovery_is_over(np.array([0.0, 29.9, 30.0, 31.0])).tolist() == [False, False, True, True]
