@@ -102,7 +102,7 @@ def _fit_channel_reference(prepared: PreparedRun) -> Channel:
     Empty where that solution does not fit the run or lies on no track: then it has a failed row of its own.
     """
     channel = prepared.config.monitors.channel_reference
-    if channel not in prepared.run.solutions():
+    if channel is None or channel not in prepared.run.solutions():
         return {}
     try:
         return {channel: (required_fit(prepared, channel, prepared.vehicle), prepared.match(channel))}

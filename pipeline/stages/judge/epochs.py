@@ -19,7 +19,7 @@ from pipeline.stages.judge.judgement import (
 )
 from pipeline.stages.track.geodesy import points_of
 from pipeline.stages.track.path import TravelledPath
-from schemas.arrays import NS_PER_S, Bools, Floats, Ints, floats, ints, runs_of, spans_of, times_ns
+from schemas.arrays import NS_PER_S, Bools, Floats, Ints, floats, ints, runs_of, spans_of, times_ns, truths
 from schemas.config import Configuration, HazardConfig, LdsConfig, Vehicle
 from schemas.enums import LdsState
 from schemas.frozen import frozen
@@ -415,11 +415,11 @@ def judged_offers(given: JudgeInput, epochs: JudgedEpochs) -> JudgedOffers:
     along = judge_with_odometer(given, positions, at_ns, given.evidence_at(at_ns))
     judged = along.turned(epochs.direction[before])
     passages = given.solution.passages
-    late = passages.filter(pl.col("odometer_distance_m") > pl.col("window_close_m"))["crossing_id"]
+    late = truths(passages["odometer_distance_m"] > passages["window_close_m"])
     return JudgedOffers.of_crossings(
         crossings,
         rows,
-        beyond_window=np.isin(rows, ints(late)),
+        beyond_window=np.isin(rows, ints(passages["crossing_id"])[late]),
         judged=judged,
         location_error_m=judged.known_error_m(hazards.known_error_m),
         proof_margin_m=np.where(judged.is_right, judged.limit_m - judged.largest_m, np.nan),

@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from enum import StrEnum
 
 import numpy as np
+from numpy.lib.stride_tricks import sliding_window_view
 
 from schemas.arrays import Bools, Floats, Ints, median
 from schemas.frozen import frozen
@@ -210,7 +211,8 @@ def _spread(instruments: Floats, left: Floats, used: Bools, reach: int) -> Float
     """Variance of the moments where the noise is alike everywhere: by its autocovariance up to `reach` movements."""
     count = min(reach + 1, left.size)
     counts = used.astype(np.float64)
-    pairs = np.array([counts[apart:] @ counts[: left.size - apart] for apart in range(count)])
+    # How many pairs are so far apart: of whole numbers all products at once are the same to the last bit.
+    pairs = sliding_window_view(np.append(counts, np.zeros(count - 1)), left.size) @ counts
     sums = np.array([left[apart:] @ left[: left.size - apart] for apart in range(count)])
     share = 1.0 - np.arange(count) / (reach + 1.0)
     covariance = share * sums / np.maximum(pairs, 1.0)
